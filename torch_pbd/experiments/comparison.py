@@ -196,21 +196,17 @@ def describe(demonstrations: Demonstrations, source: str) -> str:
 def figure_of(model: CovarianceRegressor, demonstrations: Demonstrations, name: str, input: Input = "time") -> Figure:
     """Every output over the input with its band, beyond the data too; two outputs also in the plane."""
     n_outputs = demonstrations.n_outputs
-    figure, axes = _panels(n_outputs + (n_outputs == 2), 3.3)
+    figure, plane, bands = style.panels(n_outputs, 2 if n_outputs == 2 else 0, style.quiet_figure)
     X, y, _ = demonstrations.stack(input)
-    plotting.plot_model_bands(model, X, y, axes[:n_outputs])
-    for output, ax in enumerate(axes[:n_outputs]):
+    plotting.plot_model_bands(model, X, y, bands)
+    for output, ax in enumerate(bands):
         if input == "time":
             plotting.plot_demonstrations(demonstrations, [output], ax)
         else:
             ax.set(xlabel="phase", ylabel=style.output_label(demonstrations, output))
-    plotting.legend_below(figure, axes[0])
-    if n_outputs == 2:
-        plotting.plot_demonstrations(demonstrations, [0, 1], axes[2])
-        query = np.linspace(X.min(), X.max(), 15)[:, np.newaxis]
-        plotting.plot_covariance_ellipses(*model.predict(query, return_cov=True), axes[2])
-        style.equal_scales(axes[2])
-        axes[2].set_title("2 sd ellipses", fontsize=10)
+    for ax in plane:
+        plotting.MovementDisplay.from_estimator(model, demonstrations, names=["model"], input=input, ax=ax)
+    plotting.legend_below(figure, [*plane, *bands])
     figure.suptitle(name)
     return figure
 
@@ -218,18 +214,11 @@ def figure_of(model: CovarianceRegressor, demonstrations: Demonstrations, name: 
 def figure_of_recordings(demonstrations: Demonstrations, name: str) -> Figure:
     """Every output over the time, at most nine of them."""
     n = min(demonstrations.n_outputs, 9)
-    figure, axes = _panels(n, 2.6)
-    for output, ax in enumerate(axes):
+    figure, _, bands = style.panels(n, make=style.quiet_figure)
+    for output, ax in enumerate(bands):
         plotting.plot_demonstrations(demonstrations, [output], ax)
     figure.suptitle(name if n == demonstrations.n_outputs else f"{name}: 9 of {demonstrations.n_outputs} outputs")
     return figure
-
-
-def _panels(n: int, height: float) -> tuple[Figure, list[Any]]:
-    """Figure with n Axes in three columns, 4 by ``height`` inches each."""
-    n_columns, n_rows = min(3, n), -(-n // 3)
-    figure = Figure(figsize=(4.0 * n_columns, height * n_rows))
-    return figure, [figure.add_subplot(n_rows, n_columns, i + 1) for i in range(n)]
 
 
 def run_recordings(

@@ -1,7 +1,6 @@
 """The robotic experiment of Section V, Figures 5 to 8, on any demonstrations, of a tool that turns too."""
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,6 @@ from torch_pbd.plotting import parts, poses, style
 _N_ELLIPSES = 13  # one every 0.8 s of the paper's movement: more would cover each other
 _MOST_OUTPUTS = 6  # panels of Figure 7 that a page holds
 _N_STEPS = 101  # steps at which demonstrations of poses are compared
-_figure = partial(Figure, layout="constrained")
 
 
 def run_robot(
@@ -41,7 +39,7 @@ def run_robot(
             raise ConfigError(
                 f"data: a pose has three positions and a rotation, not the outputs {demonstrations.names}."
             )
-        axes = poses.draw_poses(demonstrations, poses.draw_recorded_poses, 3, _figure)
+        axes = poses.draw_poses(demonstrations, poses.draw_recorded_poses, 3, style.quiet_figure)
         folder.write_figure(axes[0].figure, "figure6_task")
     table: list[dict[str, Any]] = []
     rows: list[dict[str, Any]] = []
@@ -191,9 +189,8 @@ def pushes_figure(run: Run, name: str) -> Figure:
 
 def pose_variability_figure(run: Run, demonstrations: Demonstrations, name: str) -> Figure:
     """Planned path, deviations and empirical ones in principal axes, and stiffness there, of both blocks: Figure 7."""
-    figure, (space,), bands = style.panels(4, 3, _figure)
-    for path in demonstrations.to_poses()[0]:
-        space.plot(*path.T, color=plotting.DATA, lw=0.8)
+    figure, (space,), bands = style.panels(4, 3, style.quiet_figure)
+    plotting.plot_demonstrations(demonstrations, [0, 1, 2], space)
     poses.draw_pose_schedule(run.schedule, space, bands)
     phase, covariances = empirical_covariances(demonstrations)
     for kind, band in zip(KINDS, bands, strict=False):

@@ -127,15 +127,11 @@ def run_demo(models: Mapping[str, CovarianceRegressor], folder: RunFolder, *, n_
 
 def _tunnel_figure(models: Mapping[str, CovarianceRegressor], demonstrations: Demonstrations) -> Figure:
     """Mean and covariance of each model in the tunnel: the paper's Figure 6."""
-    figure, axes = style.figure_grid(1, len(models), (3.2 * len(models), 5.4), sharey=True)
-    duration = demonstrations.times[0][-1]
-    query, few = np.linspace(0.0, duration, 200)[:, np.newaxis], np.linspace(0.0, duration, 13)[:, np.newaxis]
+    figure, axes = style.figure_grid(1, len(models), (2.6 * len(models), 5.6), sharey=True)
     for ax, (name, model) in zip(axes[0], models.items(), strict=True):
         draw_tunnel(ax)
-        plotting.plot_demonstrations(demonstrations, [0, 1], ax)
         # The spread along y is of micrometres: the ellipses show as lines across the path.
-        plotting.plot_covariance_ellipses(*model.predict(few, return_cov=True), ax, label="model: 2 sd, every 0.8 s")
-        ax.plot(*model.predict(query).T, color=plotting.MODEL, lw=1.5, label="model: mean")
+        plotting.MovementDisplay.from_estimator(model, demonstrations, names=["model"], ax=ax)
         ax.set_title(name)
         ax.label_outer()
     plotting.legend_below(figure, axes[0, 0])

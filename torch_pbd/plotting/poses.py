@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.plotting import style
-from torch_pbd.plotting.parts import draw_blocks
+from torch_pbd.plotting.parts import draw_blocks, plot_demonstrations
 from torch_pbd.rotations import matrix
 
 _TURN = np.linspace(0.0, 2.0 * np.pi, 21)
@@ -93,8 +93,8 @@ def draw_recorded_poses(demonstrations: Any, ax: Axes, bands: Sequence[Axes]) ->
     """Draw demonstrated poses: paths in space with frames at a few phases, and rotations over time."""
     places, turns = demonstrations.to_poses()
     length = _LENGTH * float(np.ptp(np.concatenate(places), axis=0).max())
+    plot_demonstrations(demonstrations, [0, 1, 2], ax)
     for k, (path, turn) in enumerate(zip(places, turns, strict=True)):
-        ax.plot(*path.T, color=style.DATA, lw=1.0, alpha=0.8, label=None if k else "demonstrations", zorder=1)
         some = np.linspace(0, len(path) - 1, 4).round().astype(int)
         plot_frames(path[some], turn[some], ax, length=length, label=None if k else "tool")
         style.mark_ends(ax, path, label=k == 0)
