@@ -121,7 +121,6 @@ BAD_PARAMETERS = {
     "solver": ("adam", ValueError),
     "reg_covar": (0.0, ValueError),
     "latent_prior": ("False", ValueError),
-    "bias_correction": (None, ValueError),
 }
 
 

@@ -83,7 +83,7 @@ def _simulation_figure(model: CovarianceRegressor, X: Floats, y: Floats, name: s
         ax.set(xlabel="input xi", ylabel=f"output y{output + 1}")
     inputs, empirical = empirical_covariances(X, y)
     true = paper_mean(inputs), paper_covariance(inputs, reading=reading)
-    plotting.plot_covariance_ellipses(*true, plane, color=plotting.TRUTH, label="truth", linestyle="--")
+    plotting.plot_covariance_ellipses(*true, plane, color=plotting.TRUTH, label="truth")
     if empirical is not None:
         centres = np.stack([y[X[:, 0] == xi].mean(axis=0) for xi in inputs[:, 0]])
         plotting.plot_covariance_ellipses(centres, empirical, plane, color=plotting.EMPIRICAL, label="empirical")

@@ -171,9 +171,8 @@ class MovementDisplay:
         if len(shown) == 2:
             some = np.linspace(0, len(self.grid) - 1, _N_ELLIPSES).round().astype(int)
             for (mean, covariance), color in laws if self.truth is None else [*laws, (self.truth, style.TRUTH)]:
-                look: Any = {"n_std": self.n_std, "color": color, "linestyle": "--" if color == style.TRUTH else "-"}
                 in_plane = covariance[some][:, shown][:, :, shown]
-                parts.plot_covariance_ellipses(mean[some][:, shown], in_plane, ax, **look)
+                parts.plot_covariance_ellipses(mean[some][:, shown], in_plane, ax, n_std=self.n_std, color=color)
         style.mark_ends(ax, laws[0][0][0][:, shown])
         style.equal_scales(ax)
 

@@ -80,11 +80,10 @@ def plot_covariance_ellipses(
     n_std: float = 2.0,
     color: str = style.MODEL,
     label: str | None = None,
-    linestyle: str = "-",
 ) -> LineCollection:
-    """Draw the ``n_std`` ellipses of covariances (n, 2, 2) around means (n, 2)."""
-    curves = style.ellipses(mean, covariance, ax, n_std, 2)[:, 0]
-    drawn = LineCollection(list(curves), colors=color, linewidths=1.1, linestyles=linestyle, label=label, zorder=3)
+    """Draw the ``n_std`` ellipses of covariances (n, 2, 2) around means (n, 2); dashed in the colour of the truth."""
+    curves, dash = style.ellipses(mean, covariance, ax, n_std, 2)[:, 0], style.dash_of(color)
+    drawn = LineCollection(list(curves), colors=color, linewidths=1.1, linestyles=dash, label=label, zorder=3)
     ax.add_collection(drawn)
     ax.autoscale_view()
     return drawn
@@ -146,8 +145,8 @@ def plot_model_bands(
 
 def draw_edges(x: Floats, mean: Floats, std: Floats, ax: Axes, label: str, color: str = style.EMPIRICAL) -> None:
     """Draw lines two standard deviations above and below a mean."""
-    edges, dash = np.stack([mean + 2.0 * std, mean - 2.0 * std], axis=1), "--" if color == style.TRUTH else "-"
-    ax.plot(x, edges, dash, color=color, lw=1.0, zorder=2.5)[0].set_label(label)
+    edges = np.stack([mean + 2.0 * std, mean - 2.0 * std], axis=1)
+    ax.plot(x, edges, style.dash_of(color), color=color, lw=1.0, zorder=2.5)[0].set_label(label)
 
 
 def plot_stiffness(schedule: Any, ax: Axes, block: slice | None = None) -> list[Line2D]:

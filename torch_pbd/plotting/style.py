@@ -26,6 +26,11 @@ _FLAT = 3.0  # ratio of the sides of a plane from which on equal scales would le
 POSE_NAMES = ("x", "y", "z", "rx", "ry", "rz")
 
 
+def dash_of(color: str) -> str:
+    """Style of a line of this colour: dashed for the truth."""
+    return "--" if color == TRUTH else "-"
+
+
 class Kind(NamedTuple):
     """Outputs that share a unit: words and units of what pushes do to them."""
 
