@@ -83,7 +83,7 @@ def test_an_unlikely_point_is_told_and_met(controller):
 
 
 def test_a_movement_that_was_pushed_goes_on_from_where_it_is(controller):
-    pushed = controller._path(np.array([1.0]))[0] + [0.02, -0.02]
+    pushed = controller.predict([[1.0]])[0] + [0.02, -0.02]
     again = controller.condition([1.0], [pushed])
     np.testing.assert_allclose(again.predict([[1.0]])[0], pushed, atol=1e-6)
     before, after = controller.predict([[1.2], [2.0]]), again.predict([[1.2], [2.0]])

@@ -159,7 +159,7 @@ class DMPController(Planning):
         UserWarning
             If samples at nearly equal times were merged, or recordings have gaps, with their times.
         """
-        for name in ("law_", "_bend", "_shown"):  # a fit that fails leaves no mixture of two
+        for name in ("law_", "_shown"):  # a fit that fails leaves no mixture of two
             self.__dict__.pop(name, None)
         self._check_parameters()
         # 1. Recordings. Samples at equal times are merged; the table of gaps is Type I uncertainty.

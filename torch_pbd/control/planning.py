@@ -7,15 +7,14 @@ from typing import Any, Self, final
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicSpline
 from sklearn.base import BaseEstimator
 from sklearn.utils.validation import check_array, check_is_fitted
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.control.impedance import gains_at
+from torch_pbd.control.impedance import Gains, gains_at
 from torch_pbd.control.primitive.outputs import Outputs
-from torch_pbd.control.primitive.reproduction import Reproduction, held
+from torch_pbd.control.primitive.reproduction import Reproduction
 from torch_pbd.control.schedule.rows import tick_times
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.plant import AdmittancePlant
@@ -71,7 +70,6 @@ class Planning(BaseEstimator):
     start_time_: float
     time_scale_: float
     mass: Any
-    _bend: CubicSpline | None = None
 
     @property
     def mass_(self) -> float | Floats:
@@ -86,7 +84,7 @@ class Planning(BaseEstimator):
         Outputs are positions, and for poses also three coordinates of the rotation, see :meth:`predict_pose`. The
         movement starts at ``start_time_``, ends ``duration_`` later, and then stays at the goal.
         """
-        return self._path(self._movement_time(X))
+        return self.reproduction_.motion(self._movement_time(X))[0]
 
     def predict_pose(self, X: ArrayLike) -> tuple[Floats, Floats]:
         """Reproduced positions (n, p) and orientations (n, 4), unit quaternions w x y z, at times X (n, 1)."""
@@ -123,17 +121,15 @@ class Planning(BaseEstimator):
         if self.outputs_.reference is not None and np.ndim(noise_scale) == 0 and noise_scale != 0.0:
             must = f"0, or {self.n_outputs_} numbers, the last three in rad"
             raise checks.refusal(noise_scale, "noise_scale", must, "m and rad have no scale in common")
-        return conditioned(self, time, position - self._path(time), noise_scale)
+        return conditioned(self, time, position - self.reproduction_.motion(time)[0], noise_scale)
 
     def predict_stiffness(self, X: ArrayLike) -> Floats:
         """Stiffness (n, d, d) at times X (n, 1), in N/m, Nm/rad for angles, and both in world axes for poses."""
-        time = self._movement_time(X)
-        return gains_at(self, time, self._path(time)).stiffness
+        return self._gains(X).stiffness
 
     def predict_damping(self, X: ArrayLike) -> Floats:
         """Damping (n, d, d) at times X (n, 1), in N s/m or Nm s/rad."""
-        time = self._movement_time(X)
-        return gains_at(self, time, self._path(time)).damping
+        return self._gains(X).damping
 
     def schedule(
         self,
@@ -186,7 +182,7 @@ class Planning(BaseEstimator):
         time = tick_times(self.duration_ / speed, rate, self.n_outputs_, settle=settle)
         goal, start = self._place(goal, "goal", len(time) if via is None else 0), self._place(start, "start")
         bent, goal, start = planned(self, goal, start, via)
-        path, velocity, acceleration, moved = bent._motion(time, goal, start, speed)
+        path, velocity, acceleration, moved = bent.reproduction_.plan(time, goal, start, speed)
         rows: dict[str, Any] = outputs.motion(path, velocity, acceleration)
         largest = np.linalg.norm(rows["velocity"][:, : outputs.n_positions], axis=1).max()
         self._refuse_beyond(bounds, distance=np.linalg.norm(np.ptp(rows["position"], axis=0)), speed=largest)
@@ -218,23 +214,10 @@ class Planning(BaseEstimator):
         """
         return simulate(self.schedule(rate), force, plant=plant, random_state=random_state)
 
-    def _path(self, time: Floats) -> Floats:
-        """Reproduced position (n, d) at movement times (n,)."""
-        position = self.reproduction_.motion(time)[0]
-        return position if self._bend is None else position + held(self._bend, time)
-
-    def _motion(
-        self, time: Floats, goal: Floats | None, start: Floats | None, speed: float
-    ) -> tuple[Floats, Floats, Floats, Floats]:
-        """Outputs, their velocity and acceleration (n, d) at times (n,), and the movement time of the gains there."""
-        position, velocity, acceleration, moved = self.reproduction_.plan(time, goal, start, speed)
-        if self._bend is not None:
-            pace = np.gradient(moved, time)
-            rate, slope = pace[:, np.newaxis], np.gradient(pace, time)[:, np.newaxis]
-            change, first, second = (held(self._bend, moved, order) for order in range(3))
-            position, velocity = position + change, velocity + rate * first
-            acceleration = acceleration + rate**2 * second + slope * first
-        return position, velocity, acceleration, moved
+    def _gains(self, X: ArrayLike) -> Gains:
+        """Gains at times X (n, 1)."""
+        time = self._movement_time(X)
+        return gains_at(self, time, self.reproduction_.motion(time)[0])
 
     def _place(self, value: ArrayLike | None, name: str, n_ticks: int = 0) -> Floats | None:
         """Goal or start as outputs (d,), None as shown, or a goal that may move, (n_ticks, d)."""

@@ -52,7 +52,9 @@ def conditioned(
     knots = np.unique(np.append(even[far], own))
     result = copy.copy(controller)
     result.covariance_, result._shown = bent, shown
-    result._bend = CubicSpline(knots, outputs.decode(moved.predict(phase(knots)) - shown.predict(phase(knots))))
+    result.reproduction_ = copy.copy(controller.reproduction_)
+    changes = outputs.decode(moved.predict(phase(knots)) - shown.predict(phase(knots)))
+    result.reproduction_.bend = CubicSpline(knots, changes)
     return result
 
 
@@ -81,7 +83,9 @@ def planned(
         rest[name] = None if share == 1.0 else own + (1.0 - share) * change
         known.append((at, share * change))
     even = np.linspace(0.0, controller.duration_, 2 * controller.n_steps)
-    path = CubicSpline(even, controller._motion(even, rest["goal"], rest["start"], 1.0)[0]) if points else None
+    path = (
+        CubicSpline(even, controller.reproduction_.plan(even, rest["goal"], rest["start"], 1.0)[0]) if points else None
+    )
     for number, (at, position) in enumerate(points):
         change = position - path(at)
         distance, limit = _distance(controller, at, change)

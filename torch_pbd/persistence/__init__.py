@@ -122,7 +122,7 @@ def _described(estimator: Any) -> tuple[dict[str, Any], Arrays]:
                 f"estimator has an attribute {min(unknown)!r}, which a model file cannot hold: delete it, or pickle "
                 "the estimator."
             )
-    elif {"_bend", "_known"} & set(vars(estimator)):
+    elif {"_shown", "_known"} & set(vars(estimator)):
         raise TypeError("estimator was conditioned, which a file cannot hold: save it before, or pickle it.")
     else:
         arrays = estimator._arrays()

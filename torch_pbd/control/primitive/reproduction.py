@@ -44,13 +44,14 @@ _DECAY = {"s": (1e-6, 30.0), "log_s": (1e-6, 1e12)}
 _Path = tuple[Floats, Floats, Floats]  # position, velocity and acceleration (n, d)
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Reproduction:
     """Movement primitive with its forcing, and the motion that follows from them.
 
     From ``start`` (d,) with ``velocity`` (d,) to ``goal`` (d,), by the ``forcing`` (m, d), which is linear between even
     times from 0 to the duration, held after it, and was learned over what ``phase_input`` says. With ``own_goals`` the
-    goal in eq. (18) is the end of each movement, else the common one. ``blocks`` of outputs share a unit.
+    goal in eq. (18) is the end of each movement, else the common one. ``blocks`` of outputs share a unit. The ``bend``
+    is what observations add to the motion, over movement time, after it was adapted to a start and a goal.
     """
 
     dmp: DMP
@@ -61,6 +62,7 @@ class Reproduction:
     velocity: Floats
     goal: Floats
     forcing: Floats
+    bend: PPoly | None = None
 
     @classmethod
     def learn(cls, movements: Movements, *settings: Any, blocks: tuple[slice, ...], own_goals: bool) -> "Reproduction":
@@ -126,8 +128,8 @@ class Reproduction:
 
     def motion(self, time: Floats) -> _Path:
         """Position, velocity and acceleration (n, d) at any times (n,): at rest before 0, and long after the end."""
-        position, velocity, acceleration = (held(self._curve, time, order) for order in range(3))
-        return position, velocity, acceleration
+        path = _held(self._curve, time)
+        return path if self.bend is None else _sum(path, _held(self.bend, time))
 
     @cached_property
     def _curve(self) -> CubicHermiteSpline:
@@ -170,26 +172,20 @@ class Reproduction:
             still, step = np.zeros(goals.shape), float(passed[1])
             run = self.dmp.rollout(still, step, goal=goals - self.goal, position0=start - self.start)
             answer = CubicHermiteSpline(step * np.arange(len(passed)), *(part.numpy() for part in run), axis=0)
-            position, velocity, acceleration = path
-            path = position + answer(passed), velocity + answer(passed, 1), acceleration + answer(passed, 2)
+            path = _sum(path, (answer(passed), answer(passed, 1), answer(passed, 2)))
         return path, passed
 
     def _safe(self, passed: Floats, goals: Floats, start: Floats, changed: bool) -> tuple[_Path, Floats]:
         """Motion by movement time, adapted without a throw, and that of the gains."""
-        moved, rate, slope, known = self._braked(passed)
-        velocity = self._curve(moved, 1)
-        path = (
-            self._curve(moved),
-            velocity * rate[:, np.newaxis],
-            self._curve(moved, 2) * rate[:, np.newaxis] ** 2 + velocity * slope[:, np.newaxis],
-        )
+        *braked, known = self._braked(passed)
+        path = _along(self._curve, *braked)
         if changed:
             whole = _tensor(self._curve(self.time)), _tensor(self.time)
             ends = {"own_goal": _tensor(self.goal), "goals": _tensor(goals), "start": _tensor(start)}
             run = adapt(tuple(map(_tensor, path)), _tensor(passed), whole, **ends, duration=float(self.time[-1]))
             position, velocity, acceleration = (part.numpy() for part in run)
             path = position, velocity, acceleration
-        return path, known
+        return (path if self.bend is None else _sum(path, _along(self.bend, *braked))), known
 
     def _braked(self, passed: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Movement time (n,) that comes to rest at the end of the movement, its derivatives, and that of the gains.
@@ -214,11 +210,20 @@ class Reproduction:
         return np.minimum(moved, end), rate, slope, np.maximum(moved, passed - 0.5 * brake)
 
 
-def held(curve: PPoly, time: Floats, order: int = 0) -> Floats:
-    """Values (n, d) of a curve at times (n,), or a derivative; constant before its start and after its end."""
+def _along(curve: PPoly, moved: Floats, rate: Floats, slope: Floats) -> _Path:
+    """Motion (n, d) along a curve whose own time (n,) moves at a rate (n,), which changes at a slope (n,)."""
+    rate, slope, velocity = rate[:, np.newaxis], slope[:, np.newaxis], curve(moved, 1)
+    return curve(moved), velocity * rate, curve(moved, 2) * rate**2 + velocity * slope
+
+
+def _held(curve: PPoly, time: Floats) -> _Path:
+    """Motion (n, d) along a curve at times (n,): at rest before its start and after its end."""
     within = np.clip(time, curve.x[0], curve.x[-1])
-    values: Floats = curve(within, order)
-    return values if order == 0 else np.where((within == time)[:, np.newaxis], values, 0.0)
+    return _along(curve, within, 1.0 * (within == time), np.zeros(len(time)))
+
+
+def _sum(first: _Path, second: _Path) -> _Path:
+    return first[0] + second[0], first[1] + second[1], first[2] + second[2]
 
 
 def primitive(controller: Any) -> DMP:
