@@ -23,7 +23,7 @@ _TINY, _SMALL = 1e-4, 1e-3
 _MAX_STEPS = 100
 
 
-def _library(array: Array) -> Any:
+def library_of(array: Array) -> Any:
     """NumPy or torch, by the type of the array."""
     return sys.modules[type(array).__module__.partition(".")[0]]
 
@@ -37,17 +37,17 @@ def multiply(first: Array, second: Array) -> Array:
         a0 * b2 - a1 * b3 + a2 * b0 + a3 * b1,
         a0 * b3 + a1 * b2 - a2 * b1 + a3 * b0,
     ]
-    return _library(first).stack(product, -1)
+    return library_of(first).stack(product, -1)
 
 
 def conjugate(quaternion: Array) -> Array:
     """Inverse rotation."""
-    return _library(quaternion).concatenate([quaternion[..., :1], -quaternion[..., 1:]], axis=-1)
+    return library_of(quaternion).concatenate([quaternion[..., :1], -quaternion[..., 1:]], axis=-1)
 
 
 def exp(vector: Array) -> Array:
     """Quaternion (..., 4) of a rotation vector (..., 3)."""
-    library = _library(vector)
+    library = library_of(vector)
     half = 0.5 * library.linalg.norm(vector, axis=-1, keepdims=True)
     return library.concatenate([library.cos(half), 0.5 * library.sinc(half / math.pi) * vector], axis=-1)
 
@@ -60,7 +60,7 @@ def log(quaternion: Floats) -> Floats:
 
 def between(start: Array, end: Array) -> Array:
     """Rotation vector (..., 3) in world axes from one quaternion (..., 4) to another, the shorter way."""
-    library = _library(end)
+    library = library_of(end)
     nearer = library.where((end * start).sum(-1)[..., None] < 0.0, -end, end)
     # The difference keeps the digits of small rotations: q2 q1' = 1 + (q2 - q1) q1'.
     away = multiply(nearer - start, conjugate(start))
@@ -69,7 +69,7 @@ def between(start: Array, end: Array) -> Array:
 
 def _vector(w: Array, xyz: Array) -> Array:
     """Rotation vector (..., 3) of a quaternion with w >= 0."""
-    library = _library(xyz)
+    library = library_of(xyz)
     length = library.linalg.norm(xyz, axis=-1, keepdims=True)
     tiny = length < library.finfo(length.dtype).tiny
     return library.where(tiny, 2.0, 2.0 * library.arctan2(length, w) / library.where(tiny, 1.0, length)) * xyz
@@ -101,7 +101,7 @@ def cross_matrix(vector: Array) -> Array:
     """Matrix (..., 3, 3) of the cross product with a vector (..., 3) from the left."""
     x, y, z = (vector[..., i] for i in range(3))
     zero = 0.0 * x
-    return _library(vector).stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*vector.shape, 3)
+    return library_of(vector).stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*vector.shape, 3)
 
 
 def left_jacobian(vector: Floats) -> Floats:

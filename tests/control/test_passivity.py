@@ -9,7 +9,6 @@ import torch
 
 from torch_pbd.control.filters import EnergyTank, RateLimit, lyapunov_matrix
 from torch_pbd.control.matrices import damping_from_stiffness
-from torch_pbd.control.simulation import ticks
 from torch_pbd.control.simulation.plant import AdmittancePlant
 from torch_pbd.control.simulation.ticks import admittance_rate
 
@@ -172,7 +171,7 @@ def test_the_worst_force_cannot_break_the_rate_limit_nor_is_a_share_too_small(dt
     """
     stiffness, damping = schedules(200, 2, generator)
     alpha = 0.03
-    limit = RateLimit(alpha).start(stiffness, damping, MASS, ticks.tick_change)
+    limit = RateLimit(alpha).start(stiffness, damping, MASS)
     nowhere = torch.zeros(200, 2).double()
     gains = []
     for k in (0, 1):

@@ -9,7 +9,7 @@ held back in the tool frame. The arithmetic is the same on tensors (..., d) of m
 NumPy's arrays of one robot, in the real-time loop: of functions that have the same names in both.
 """
 
-import sys
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,13 +17,10 @@ from typing import Any, final
 
 from torch_pbd import checks
 from torch_pbd.exceptions import InvalidParameterError
+from torch_pbd.rotations import library_of
 
 # A tensor, or an array of NumPy.
 Array = Any
-# Matrix (..., 2 d, 3 d) from deviation, velocity and held force to the change of the first two over a tick, as a
-# function of stiffness, damping, mass (..., d, d) and the length of the tick in s.
-TickChange = Callable[[Array, Array, Array, float], Array]
-
 State = tuple[Array, Array]  # deviation and velocity (..., d)
 Energy = Callable[[Array, Array], Array]  # energy (...) in J from stiffness (..., d, d) and deviation (..., d)
 
@@ -35,7 +32,7 @@ class StiffnessFilter(ABC):
     """Filter of the gains for :class:`~torch_pbd.control.AdmittancePlant` and the real-time loop."""
 
     @abstractmethod
-    def start(self, stiffness: Array, damping: Array, mass: Array, change: TickChange) -> "ActiveFilter":
+    def start(self, stiffness: Array, damping: Array, mass: Array) -> "ActiveFilter":
         """Running filter for a schedule with gains (..., T, d, d) and a mass (d, d) or (..., T, d, d)."""
 
 
@@ -67,8 +64,8 @@ class RateLimit(StiffnessFilter):
     def __post_init__(self) -> None:
         checks.number(self.alpha, "alpha", above=0.0, unit="1/s", optional=True)
 
-    def start(self, stiffness: Array, damping: Array, mass: Array, change: TickChange) -> "ActiveFilter":  # noqa: D102
-        linalg = _library(stiffness).linalg
+    def start(self, stiffness: Array, damping: Array, mass: Array) -> "ActiveFilter":  # noqa: D102
+        linalg = library_of(stiffness).linalg
         inverse = linalg.inv(linalg.cholesky(mass))
         limit = float(linalg.eigvalsh(inverse @ damping @ inverse.mT).min())
         softest = float(linalg.eigvalsh(stiffness).min())
@@ -77,8 +74,8 @@ class RateLimit(StiffnessFilter):
         checks.number(alpha, "alpha", above=0.0, below=limit, unit="1/s", remedy=remedy)
         remedy = "a rate limit needs it, for a free axis has no equilibrium"
         checks.number(softest, "the smallest eigenvalue of stiffness", above=0.0, unit="N/m", remedy=remedy)
-        return _ActiveRateLimit(alpha, change)
-        return _ActiveRateLimit(alpha, change)
+        return _ActiveRateLimit(alpha)
+        return _ActiveRateLimit(alpha)
 
 
 @final
@@ -116,7 +113,7 @@ class EnergyTank(StiffnessFilter):
         checks.number(self.energy, "energy", least=0.0, most=self.energy_max, unit="J")
         checks.number(self.efficiency, "efficiency", least=0.0, below=1.0)
 
-    def start(self, stiffness: Array, damping: Array, mass: Array, change: TickChange) -> "ActiveFilter":  # noqa: D102
+    def start(self, stiffness: Array, damping: Array, mass: Array) -> "ActiveFilter":  # noqa: D102
         return _ActiveTank(self)
 
 
@@ -143,7 +140,7 @@ class ActiveFilter(ABC):
         ``scale`` (..., d) is the scale of springs that limits reduce.
         """
         if self.gains is None:
-            library, shape = _library(off), (*off.shape, off.shape[-1])
+            library, shape = library_of(off), (*off.shape, off.shape[-1])
             wanted = [library.broadcast_to(gain, shape) for gain in (stiffness, damping)]
             self.gains = wanted[0], wanted[1], library.ones_like(off[..., 0])
             if self.tank_energy is not None:
@@ -159,7 +156,7 @@ class ActiveFilter(ABC):
     def carry(self, turn: Array) -> None:
         """Rotate the gains with the desired orientation, by a matrix (..., 3, 3), at the end of a tick."""
         stiffness, damping, share = self.gains
-        library, d = _library(turn), stiffness.shape[-1]
+        library, d = library_of(turn), stiffness.shape[-1]
         whole = library.zeros((*turn.shape[:-2], d, d), dtype=turn.dtype, device=turn.device)
         whole[..., : d - 3, : d - 3] = library.eye(d - 3)
         whole[..., d - 3 :, d - 3 :] = turn
@@ -180,7 +177,7 @@ class _ActiveTank(ActiveFilter):
         self._tank, self.tank_energy = tank, tank.energy
 
     def _paid_share(self, stiffness: Array, damping: Array, mass: Array, off: Array, scaled: Array) -> Array:
-        asked, where = 0.5 * _quadratic(stiffness - self.gains[0], off, scaled), _library(off).where
+        asked, where = 0.5 * _quadratic(stiffness - self.gains[0], off, scaled), library_of(off).where
         lacking = asked > self.tank_energy
         share = where(lacking, (1.0 - _MARGIN) * self.tank_energy / where(lacking, asked, 1.0), 1.0)
         self._pay(share * asked)
@@ -191,15 +188,15 @@ class _ActiveTank(ActiveFilter):
         stored = [energy(stiffness, off) + spring_energy(mass, velocity) for off, velocity in (before, after)]
         dissipated = stored[0] + (force * (after[0] - before[0])).sum(-1) - stored[1]
         # Negative dissipation comes from rounding or from a limit of the command, and is charged in full.
-        self._pay(-_library(force).where(dissipated > 0.0, self._tank.efficiency * dissipated, dissipated))
+        self._pay(-library_of(force).where(dissipated > 0.0, self._tank.efficiency * dissipated, dissipated))
 
     def _pay(self, energy: Array) -> None:
-        self.tank_energy = _library(energy).clip(self.tank_energy - energy, 0.0, self._tank.energy_max)
+        self.tank_energy = library_of(energy).clip(self.tank_energy - energy, 0.0, self._tank.energy_max)
 
 
 class _ActiveRateLimit(ActiveFilter):
-    def __init__(self, alpha: float, change: TickChange) -> None:
-        self._alpha, self._change = alpha, change
+    def __init__(self, alpha: float) -> None:
+        self._alpha = alpha
 
     def settle(self, before: State, after: State, force: Array, energy: Energy = spring_energy) -> None:
         """Record nothing, since the payment of a tick follows from its gains."""
@@ -214,11 +211,11 @@ class _ActiveRateLimit(ActiveFilter):
         held_stiffness, held_damping, _ = self.gains
         # dP = dK + a dD, of deviations.
         rise = stiffness - held_stiffness + self._alpha * (damping - held_damping)
-        library, ones = _library(rise), 0.0 * rise[..., 0, 0] + 1.0
+        library, ones = library_of(rise), 0.0 * rise[..., 0, 0] + 1.0
         if not rise.any():
             return ones
         last_stiffness, last_damping, last_mass, step = self._tick
-        d, change = rise.shape[-1], self._change(*self._tick)
+        d, change = rise.shape[-1], tick_change(*self._tick)
         unit = library.eye(3 * d, dtype=rise.dtype, device=rise.device)
         start, forces = unit[: 2 * d], unit[2 * d :]
         # The equation of motion integrated over the tick, M dv = f h - K int(y) - D dy, gives int(y), of which the port
@@ -248,17 +245,46 @@ class _ActiveRateLimit(ActiveFilter):
         return library.where(needed > 1.0, (1.0 - _MARGIN) / library.clip(needed, 1.0, None), ones)
 
 
+def admittance_rate(stiffness: Array, damping: Array, mass: Array) -> Array:
+    """Matrix of ``[deviation, velocity, force]' = rate @ [deviation, velocity, force]`` of a held force, (..., n, n).
+
+    It is eq. (15) for gains (..., d, d), and n = 3 d.
+    """
+    library, d = library_of(stiffness), stiffness.shape[-1]
+    inverse = library.linalg.inv(mass) + 0.0 * stiffness
+    rate = library.zeros((*stiffness.shape[:-2], 3 * d, 3 * d), dtype=stiffness.dtype, device=stiffness.device)
+    rate[..., :d, d : 2 * d] = library.eye(d)
+    rate[..., d : 2 * d, :] = library.concatenate([-inverse @ stiffness, -inverse @ damping, inverse], axis=-1)
+    return rate
+
+
+def tick_change(stiffness: Array, damping: Array, mass: Array, step: float) -> Array:
+    """Matrix (..., 2 d, 3 d) from deviation, velocity and held force to the change of the first two over a tick."""
+    return expm1(step * admittance_rate(stiffness, damping, mass)[..., : 2 * stiffness.shape[-1], :])
+
+
+def expm1(matrix: Array) -> Array:
+    """exp(matrix) - 1 by Taylor series and doubling: without the 1, slow motions keep their digits beside fast ones.
+
+    Rows of zeros at the end of a square matrix may be left out, and then are of the result.
+    """
+    doublings = max(0, math.frexp(float(abs(matrix).sum(-1).max()))[1] + 1)
+    # The norm is now 1/2 at most, for which 14 terms have all digits.
+    small = matrix / 2.0**doublings
+    power, square = small / 14.0, small[..., : small.shape[-2]]
+    for order in range(13, 0, -1):
+        power = (small + square @ power) / order
+    for _ in range(doublings):
+        power = 2.0 * power + power[..., : power.shape[-2]] @ power
+    return power
+
+
 def lyapunov_matrix(stiffness: Array, damping: Array, mass: Array, alpha: float) -> Array:
     """Twice the matrix (..., 2 d, 2 d) of Kronander and Billard's V in (deviation, velocity)."""
-    concatenate, mass = _library(stiffness).concatenate, mass + 0.0 * stiffness
+    concatenate, mass = library_of(stiffness).concatenate, mass + 0.0 * stiffness
     upper = concatenate([stiffness + alpha * damping, alpha * mass], axis=-1)
     return concatenate([upper, concatenate([alpha * mass, mass], axis=-1)], axis=-2)
 
 
 def _quadratic(matrix: Array, left: Array, right: Array) -> Array:
     return (left[..., None, :] @ matrix @ right[..., :, None])[..., 0, 0]
-
-
-def _library(array: Array) -> Any:
-    """NumPy or torch, by the type of the array."""
-    return sys.modules[type(array).__module__]

@@ -84,7 +84,8 @@ class Planning(BaseEstimator):
         Outputs are positions, and for poses also three coordinates of the rotation, see :meth:`predict_pose`. The
         movement starts at ``start_time_``, ends ``duration_`` later, and then stays at the goal.
         """
-        return self.reproduction_.motion(self._movement_time(X))[0]
+        time = self._movement_time(X)
+        return self.reproduction_.motion(time)[0]
 
     def predict_pose(self, X: ArrayLike) -> tuple[Floats, Floats]:
         """Reproduced positions (n, p) and orientations (n, 4), unit quaternions w x y z, at times X (n, 1)."""

@@ -10,6 +10,7 @@ import numpy as np
 from torch_pbd import rotations
 from torch_pbd.checks import Floats
 from torch_pbd.control.controller import DMPController
+from torch_pbd.control.filters import admittance_rate
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.plant import AdmittancePlant
 from torch_pbd.control.simulation.rollout import Rollout
@@ -111,10 +112,7 @@ def damping_ratio(schedule: Schedule, damping: Floats) -> float:
     """Smallest damping ratio of the modes of ``M e'' + D e' + K e = 0`` over the rows of a schedule."""
     d, mass = schedule.n_outputs, np.asarray(1.0 if schedule.mass is None else schedule.mass)
     mass = mass if mass.ndim else mass * np.eye(d)
-    system = np.zeros((len(schedule), 2 * d, 2 * d))
-    system[:, :d, d:] = np.eye(d)
-    system[:, d:] = -np.linalg.solve(mass, np.concatenate([schedule.stiffness, damping], axis=-1))
-    modes = np.linalg.eigvals(system)
+    modes = np.linalg.eigvals(admittance_rate(schedule.stiffness, damping, mass)[:, : 2 * d, : 2 * d])
     return float((-modes.real / np.abs(modes)).min())
 
 

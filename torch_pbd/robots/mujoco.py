@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control.schedule import Schedule
+from torch_pbd.control.schedule.rows import UNEVEN, even_step
 from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.registry import optional
 from torch_pbd.robots.kinematics import MujocoArm, pose_error
@@ -21,7 +22,6 @@ from torch_pbd.robots.session import RobotRun, RobotStoppedError, accelerations,
 HOME = (0.0, -math.pi / 4, 0.0, -3 * math.pi / 4, 0.0, math.pi / 2, math.pi / 4)
 """Joint angles of the Panda in rad, far from limits and singularities: the hand points down, 0.31 m before the base."""
 
-_UNEVEN = 1e-6  # tolerance within which a tick is a whole number of simulation steps
 _POSTURE_RATE = 5.0  # rate in 1/s of the critically damped null-space motion, slower than that of the tool
 
 
@@ -109,18 +109,6 @@ def run(
     return RobotRun(schedule.time, wrench=pushes, **measured)
 
 
-def _steps_a_tick(time: Floats, timestep: float) -> int:
-    steps = np.diff(time)
-    count = round(steps[0] / timestep)
-    uneven = np.ptp(steps[:-1]) > _UNEVEN * steps[0] or steps[-1] > (1.0 + _UNEVEN) * steps[0]  # it may be shorter
-    if uneven or not count or abs(count * timestep - steps[0]) > _UNEVEN * steps[0]:
-        raise InvalidParameterError(
-            f"schedule has steps from {steps.min():g} to {steps.max():g} s, must have equal ones, a multiple of the "
-            f"model's {timestep:g} s: resample it."
-        )
-    return count
-
-
 @final
 class _Simulation:
     """MuJoCo simulation of an arm whose controller follows a schedule."""
@@ -130,7 +118,13 @@ class _Simulation:
         checks.instance(model, "model", mujoco.MjModel)
         self._schedule, self._poses, self._acceleration = schedule, poses(schedule), accelerations(schedule)
         warn_of_mass(schedule)
-        self._n_steps = _steps_a_tick(schedule.time, model.opt.timestep)
+        step = even_step(schedule.time)
+        self._n_steps = round(step / model.opt.timestep)
+        if not self._n_steps or abs(self._n_steps * model.opt.timestep - step) > UNEVEN * step:
+            raise InvalidParameterError(
+                f"schedule has steps of {step:g} s, must have a multiple of the model's {model.opt.timestep:g} s: "
+                "resample it."
+            )
         self._chain = chain = MujocoArm(model, checks.text(tool, "tool"))
         n_joints = chain.limits.shape[1]
         if model.nu != n_joints or model.nv != model.nu:

@@ -13,7 +13,7 @@ from torch_pbd.checks import Floats
 from torch_pbd.control.filters import ActiveFilter, RateLimit, StiffnessFilter
 from torch_pbd.control.realtime.clock import ScheduleClock
 from torch_pbd.control.realtime.limits import Numbers, TickStatus, finite_floats, within_limits
-from torch_pbd.control.realtime.steps import State, Vector, deviation, expm1, mean_move, moved
+from torch_pbd.control.realtime.steps import State, Vector, deviation, mean_move, moved
 from torch_pbd.control.realtime.table import Scale, ScheduleTable
 from torch_pbd.exceptions import InvalidParameterError
 
@@ -206,7 +206,7 @@ class FilteredGains:
             remedy = "before the loop nobody knows whether the damping pays for what turns or grows"
             raise checks.refusal(wanted, "stiffness_filter", must, remedy)
         self._table = table
-        self.fresh = wanted.start(table.stiffness, table.damping, mass, _tick_change)
+        self.fresh = wanted.start(table.stiffness, table.damping, mass)
 
     def advance(self, row: Vector, index: int, push: Vector, here: State, step: float) -> tuple[State, Scale]:
         """Place and velocity after a tick of ``step`` s along a row of the table, and the scale of the stiffness."""
@@ -236,12 +236,3 @@ class FilteredGains:
             stretch = float(off[spring] @ stiffness[spring, spring] @ off[spring])
             energy += 0.5 * stretch if top * stretch <= 1.0 else math.sqrt(stretch / top) - 0.5 / top
         return energy
-
-
-def _tick_change(stiffness: Floats, damping: Floats, mass: Floats, step: float) -> Floats:
-    """Matrix (2 d, 3 d) from deviation, velocity and force to the change of the first two over a tick."""
-    d = len(mass)
-    rate = np.zeros((3 * d, 3 * d))
-    rate[:d, d : 2 * d] = np.eye(d)
-    rate[d : 2 * d] = np.linalg.solve(mass, np.concatenate([-stiffness, -damping, np.eye(d)], axis=1))
-    return expm1(step * rate)[: 2 * d]

@@ -11,6 +11,7 @@ from operator import add, mul, sub
 import numpy as np
 
 from torch_pbd.checks import Floats
+from torch_pbd.control.filters import expm1
 
 Vector = tuple[float, ...]
 State = tuple[Vector, Vector]
@@ -137,19 +138,6 @@ def coupled(
     rate[d:-1] = gains / mass if isinstance(mass, float) else np.linalg.solve(mass, gains)
     change = expm1(rate) @ np.concatenate([off, np.multiply(step, velocity), [1.0]])
     return tuple(change[:d].tolist()), tuple(np.add(velocity, change[d:-1] / step).tolist())
-
-
-def expm1(matrix: Floats) -> Floats:
-    """exp(matrix) - 1 by Taylor series and doubling: without the 1, slow motions keep their digits beside fast ones."""
-    doublings = max(0, math.frexp(np.abs(matrix).sum(axis=1).max())[1] + 1)
-    # The norm is now 1/2 at most, for which 14 terms have all digits.
-    small = matrix / 2.0**doublings
-    power = small / 14.0
-    for order in range(13, 0, -1):
-        power = (small + small @ power) / order
-    for _ in range(doublings):
-        power = 2.0 * power + power @ power
-    return power
 
 
 def _responses(stiffness: float, decay: float, step: float) -> tuple[float, float]:

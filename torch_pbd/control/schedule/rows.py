@@ -16,6 +16,8 @@ from torch_pbd.files.memory import require_memory
 # Share of a tick that counts as rounding: 10 s at 1 kHz are 10001 rows, however 10 * 1000 is rounded, and time stamps
 # resolve a duration to a thousandth of their spacing, so that a shorter last interval counts as none.
 _ROUNDING = 1e-3
+UNEVEN = 1e-6
+"""Share of a tick that counts as rounding of its length: times of an hour at 1 kHz err by 5e-10 of one in float64."""
 
 
 def count_rows(duration: float, rate: float) -> int:
@@ -45,6 +47,17 @@ def tick_times(duration: float, rate: float, d: int, *, settle: float = 0.0) -> 
     if count_rows(duration, rate) < 2:
         raise checks.refusal(rate, "rate", f"at least {1 / duration:g} Hz, for two rows", unit="Hz")
     return row_times(duration, rate)
+
+
+def even_step(time: Floats) -> float:
+    """Time between the rows of a schedule, of which the last alone may come sooner."""
+    steps = np.diff(time)
+    if np.ptp(steps[:-1]) > UNEVEN * steps[0] or steps[-1] > (1.0 + UNEVEN) * steps[0]:
+        raise InvalidParameterError(
+            f"schedule has steps from {steps.min():g} to {steps.max():g} s, must be evenly spaced: take "
+            "schedule.resample(rate)."
+        )
+    return float(steps[0])
 
 
 class Between:

@@ -10,15 +10,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torch_pbd import checks, rotations
-from torch_pbd.control.simulation.ticks import (
-    State,
-    Task,
-    mass_at,
-    open_loop,
-    tick_change,
-    tick_map,
-    tick_maps,
-)
+from torch_pbd.control.simulation.ticks import State, Task, mass_at, open_loop, tick_map, tick_maps
 from torch_pbd.files.memory import require_memory
 from torch_pbd.linalg import broadcast_shapes
 
@@ -130,7 +122,7 @@ class Loop:
         self._commands = [self._deviation] * (loop.delay_steps if loop else 0)
         self._read = task.sensor and task.sensor.start(state[0], task.dt, generator)
         gains = task.stiffness, task.damping, task.mass
-        self._filter = None if task.stiffness_filter is None else task.stiffness_filter.start(*gains, tick_change)
+        self._filter = None if task.stiffness_filter is None else task.stiffness_filter.start(*gains)
         self._maps = (each for _, maps in tick_maps(task, task.dt / task.substeps) for each in maps.unbind(-3))
 
     def run(self, tick: int, force: Tensor) -> dict[str, Tensor]:

@@ -11,18 +11,16 @@ from numpy.typing import ArrayLike
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control.matrices import mass_rows
+from torch_pbd.control.schedule.rows import even_step
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.plant import AdmittancePlant
 from torch_pbd.control.simulation.rollout import Rollout, run_task, warn_if_far
 from torch_pbd.control.simulation.rollouts import RolloutSummary, push_many
 from torch_pbd.control.simulation.ticks import Task, block_length
-from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.files.memory import require_memory
 
 Range = float | tuple[float, float]
 
-# Share of a tick that counts as rounding of times: in float64, those of an hour at 1 kHz err by 5e-10 of a tick.
-_UNEVEN = 1e-6
 # Share of a mass that counts as equal: functions of time are not linear between rows, and damping ratios vary by half.
 _SAME_MASS = 1e-3
 
@@ -172,17 +170,11 @@ def _task_of(schedule: Schedule, plant: AdmittancePlant | None) -> Task:
     """Task of a plant that follows a schedule row by row; warns if its mass is not that of the schedule."""
     checks.instance(schedule, "schedule", Schedule)
     plant = checks.instance(plant, "plant", AdmittancePlant, optional=True) or AdmittancePlant(None)
-    steps = np.diff(schedule.time)
-    if np.ptp(steps[:-1]) > _UNEVEN * steps[0] or steps[-1] > (1.0 + _UNEVEN) * steps[0]:
-        raise InvalidParameterError(
-            f"schedule has steps from {steps.min():g} to {steps.max():g} s, must be evenly spaced: take "
-            "schedule.resample(rate)."
-        )
     rows = (schedule.position, schedule.velocity, schedule.stiffness, schedule.damping)
     position, velocity, stiffness, damping = map(torch.tensor, rows)  # of copies: its own are read-only
     more = {"acceleration_desired": schedule.acceleration, "orientation_desired": schedule.orientation}
     given: dict[str, Any] = {name: torch.tensor(row) for name, row in more.items() if row is not None}
-    given |= {"times": schedule.time, "dt": float(steps[0]), "own_mass": schedule.mass}
+    given |= {"times": schedule.time, "dt": even_step(schedule.time), "own_mass": schedule.mass}
     task = plant.task(position, velocity, stiffness, damping, **given)
     if schedule.mass is not None and plant.mass is not None:
         own = mass_rows(schedule.mass, stiffness)

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torch_pbd.control.filters import StiffnessFilter
+from torch_pbd.control.filters import StiffnessFilter, admittance_rate
 from torch_pbd.control.simulation.sensor import ForceSensor, PositionLoop
 from torch_pbd.linalg import broadcast_shapes
 
@@ -27,18 +27,6 @@ State = tuple[Tensor, Tensor]
 
 # Transitions that are computed together, which bounds the memory; a power of 2, as the lengths of blocks are.
 _MATRICES_AT_ONCE = 2**13
-
-
-def admittance_rate(
-    stiffness: Float[Tensor, "*b d d"], damping: Float[Tensor, "*b d d"], mass: Float[Tensor, "*m d d"]
-) -> Float[Tensor, "*b n n"]:
-    """Matrix of ``[deviation, velocity, force]' = rate @ [deviation, velocity, force]`` of a held force, n = 3 d."""
-    d = stiffness.shape[-1]
-    inverse = torch.linalg.inv(mass).expand_as(stiffness)
-    rate = stiffness.new_zeros(*stiffness.shape[:-2], 3 * d, 3 * d)
-    rate[..., :d, d : 2 * d] = torch.eye(d).to(stiffness)
-    rate[..., d : 2 * d, :] = torch.cat([-inverse @ stiffness, -inverse @ damping, inverse], dim=-1)
-    return rate
 
 
 def mass_at(mass: Tensor, ticks: int | slice) -> Tensor:
@@ -171,9 +159,3 @@ def tick_maps(task: Task, dt: float) -> Iterator[tuple[slice, Tensor]]:
 def tick_map(stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> Tensor:
     """Map of ``[deviation, velocity, force]`` to the deviation and velocity after a tick of ``dt`` s."""
     return torch.linalg.matrix_exp(dt * admittance_rate(stiffness, damping, mass))[..., : 2 * stiffness.shape[-1], :]
-
-
-def tick_change(stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> Tensor:
-    """Map of ``[deviation, velocity, force]`` to the change of deviation and velocity over a tick of ``dt`` s."""
-    each = tick_map(stiffness, damping, mass, dt)
-    return each - torch.eye(each.shape[-1]).to(each)[: each.shape[-2]]
