@@ -199,11 +199,9 @@ def figure_of(model: CovarianceRegressor, demonstrations: Demonstrations, name: 
     figure, plane, bands = style.panels(n_outputs, 2 if n_outputs == 2 else 0, style.quiet_figure)
     X, y, _ = demonstrations.stack(input)
     plotting.plot_model_bands(model, X, y, bands)
+    shown = demonstrations if input == "time" else demonstrations.align()
     for output, ax in enumerate(bands):
-        if input == "time":
-            plotting.plot_demonstrations(demonstrations, [output], ax)
-        else:
-            ax.set(xlabel="phase", ylabel=style.output_label(demonstrations, output))
+        plotting.plot_demonstrations(shown, [output], ax)
     for ax in plane:
         plotting.MovementDisplay.from_estimator(model, demonstrations, names=["model"], input=input, ax=ax)
     plotting.legend_below(figure, [*plane, *bands])

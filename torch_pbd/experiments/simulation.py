@@ -105,14 +105,11 @@ def run_demo(models: Mapping[str, CovarianceRegressor], folder: RunFolder, *, n_
     true_covariance = np.einsum("kti,ktj->tij", *(2 * [fresh - fresh.mean(axis=0)])) / (_N_FRESH - 1)
     data = demonstrations.stack()
     scores = compare_models(models, *data, truth=lambda _: true_covariance, max_folds=0, finished=folder.finished)
-    times = demonstrations.times[0][::_EVERY, np.newaxis]
-    positions = fresh[:, ::_EVERY].reshape(_N_FRESH * len(times), -1)
+    times = np.tile(demonstrations.times[0][::_EVERY], _N_FRESH)[:, np.newaxis]
+    fresh_rows = times, fresh[:, ::_EVERY].reshape(len(times), -1)
     rows = []
     for name, (model, row, _) in scores.items():
-        mean, covariance = model.predict(times, return_cov=True)
-        tiled = np.tile(mean, (_N_FRESH, 1)), np.tile(covariance, (_N_FRESH, 1, 1))
-        row["95 % of fresh"] = mahalanobis_coverage(*tiled, positions)
-        row["fresh LL"] = model.score(np.tile(times, (_N_FRESH, 1)), positions)
+        row |= {"95 % of fresh": mahalanobis_coverage(model, *fresh_rows), "fresh LL": model.score(*fresh_rows)}
         columns = ("model", "MSE", "error to truth", "fresh LL", "95 % of fresh", "least eig.", "fit [s]")
         rows.append({column: row[column] for column in columns})
         folder.write_fitted(name, model, figure_of(model, demonstrations, name))

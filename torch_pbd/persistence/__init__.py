@@ -96,8 +96,9 @@ def load(path: str | os.PathLike[str]) -> Any:
             raise
         raise ModelFileError(f"{error} {LOADERS} Pickles are never loaded.") from error
     try:
-        if not isinstance(header.pop("versions", None), dict) or header.pop("format_version") != FORMAT_VERSION:
+        if not isinstance(header.pop("versions", None), dict):
             raise ValueError("it does not say what wrote it")
+        del header["format_version"]  # which is known to be this one
         return _restored(header, arrays)
     except Exception as error:
         what = f"{header.get('class')!s:.80}"

@@ -166,21 +166,18 @@ def _bent(learned: Learned) -> DMPController:
 
 def _python(learned: Learned) -> str:
     settings, name = learned.settings, next(iter(learned.controllers))
-    around = [] if name in MOVEMENTS else ["TrajectoryRegressor"]
-    model, bent = f"TrajectoryRegressor({name}())" if around else f"{name}()", ""
+    used, bent = {"DMPController", "load_demonstrations", name}, ""
+    used |= set() if name in MOVEMENTS else {"TrajectoryRegressor"}
     if learned.via:
         times, points = [at for at, *_ in learned.via], [list(point) for _, *point in learned.via]
         bent = f"controller = controller.condition({times}, {points})\n"
     return f"""\
-from torch_pbd import {", ".join(sorted(["DMPController", "load_demonstrations", name, *around]))}
+from torch_pbd import {", ".join(sorted(used))}
 from torch_pbd.control import StiffnessLaw
 
 strokes = load_demonstrations("demonstrations.csv", units="m")
-law = StiffnessLaw({settings.stiffness_min!r}, {settings.stiffness_max!r}, smooth={settings.smooth})
-controller = DMPController(
-    {model}, n_steps={_STEPS}, stiffness_law=law, mass={settings.mass!r},
-    damping_ratio={settings.damping_ratio!r},
-).fit(strokes)
+controller = {_controller(_model(name), settings)!r}
+controller = controller.fit(strokes)
 {bent}schedule = controller.schedule(rate={_RATE:g}, speed={settings.speed!r})
 print(schedule.certify(mass={settings.mass!r}))
 schedule.save("schedule.npz")
