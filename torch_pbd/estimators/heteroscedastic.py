@@ -11,18 +11,14 @@ from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.estimators.base import CovarianceRegressor, Fit
 from torch_pbd.estimators.door import Integers, Prior, length_scale_in_ranges, period_in_ranges
-from torch_pbd.estimators.validation import (
-    check_demonstrations,
-    checked_queries,
-    warn_if_few,
-    warn_if_identical,
-    warn_of_residuals,
-)
+from torch_pbd.estimators.validation import check_demonstrations, checked_queries, warn_if_few, warn_if_identical
+from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.files.memory import require_much
 from torch_pbd.kernels import KERNELS, KernelName
-from torch_pbd.models.heteroscedastic.fit import fit_heteroscedastic
+from torch_pbd.models.heteroscedastic.fit import HeteroscedasticFit, fit_heteroscedastic
 from torch_pbd.models.heteroscedastic.module import HeteroscedasticModel
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily
+from torch_pbd.models.heteroscedastic.residuals import are_copies
 from torch_pbd.models.heteroscedastic.search import SearchOptions, candidate_families, check_memory, inducing_sizes
 
 _DRAWN = 65536  # covariance matrices drawn at a time, to bound memory
@@ -173,14 +169,15 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         checks.count(self.max_inputs, "max_inputs", least=2)
 
     def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, recorded: Integers) -> Fit:
-        if groups is not None:
+        if groups is None:
+            warn_if_few(len(y), y.shape[1])
+        else:
             check_demonstrations(X, y, groups)
         scaling, training = self._training_set(X, y)
         length_scale = length_scale_in_ranges(self.length_scale, scaling.x_scale)
         period = period_in_ranges(self.period, self.kernel, scaling.x_scale)
         held, circle = (None if value is None else self._door(value) for value in (length_scale, period))
         prior_tril = self._prior_tril(training, scaling)
-        warn_if_few(len(y), y.shape[1])
         warn_if_identical(training)
         # A mean that does not follow the data at the merged inputs is fitted anew, from all rows.
         rows, training = training, training.merged(self.max_inputs)
@@ -200,10 +197,28 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
                 f"length_scale is below {least:.3g} of the range of X, which is what the inputs (or n_inducing of "
                 "them) resolve: between them the covariance says nothing. Give a longer one, or None to learn it."
             )
-        warn_of_residuals(fit, self._door(recorded).long())
+        _warn_of_residuals(fit, self._door(recorded).long())
         self.effective_share_ = 1.0 if fit.correlation is None else float(fit.correlation.share.mean())
         report = options.outcome(tuple(-value for value in fit.log_evidence))
         return model, scaling, report, ProcessFamily.jitter
 
     def _check_memory(self, n_distinct: int, n_features: int, n_outputs: int) -> None:
         check_memory(self.n_inducing, self.max_inputs, (n_distinct, n_features, n_outputs))
+
+
+def _warn_of_residuals(fit: HeteroscedasticFit, given: torch.Tensor) -> None:
+    """Warn if rows ``given`` in this order without groups look like demonstrations, or the mean misses a signal."""
+    if fit.group is None and are_copies(fit.whitened(), fit.training, given):
+        message = (
+            "y has rows that nearly repeat those beside them along X, as samples of a demonstration do. Without groups "
+            "they count as independent, and what is predicted is far too certain. Give groups, the demonstration of "
+            "each row, to fit; cross_val_score takes params={'groups': groups}, and a search passes them on where "
+            "metadata routing is enabled and set_fit_request(groups=True) asks for them."
+        )
+        checks.warn(message, DataRankWarning)
+    elif bool((missed := fit.missed()).any()):
+        message = (
+            f"The mean does not follow y in outputs {missed.nonzero().flatten().tolist()}: what is left is no noise, "
+            "but counts as such. Raise n_inducing and max_inputs; give groups if the rows are of demonstrations."
+        )
+        checks.warn(message)

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import issparse
 from sklearn.utils.validation import check_is_fitted, has_fit_parameter, validate_data
-from torch import Tensor
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
@@ -15,8 +14,6 @@ from torch_pbd.data import Demonstrations
 from torch_pbd.data.alignment import interpolate, unit_phases
 from torch_pbd.data.description import follow_one_way
 from torch_pbd.exceptions import DataRankWarning
-from torch_pbd.models.heteroscedastic.fit import HeteroscedasticFit
-from torch_pbd.models.heteroscedastic.residuals import are_copies
 from torch_pbd.models.training import TrainingSet
 
 CONSTANT = 1e-11
@@ -193,7 +190,7 @@ def check_demonstrations(X: Floats, y: Floats, groups: Any) -> None:
             "count as independent. What is predicted is its noise, not how demonstrations differ.",
             DataRankWarning,
         )
-    elif len(y) > y.shape[1]:
+    else:
         warn_if_few(len(y), y.shape[1], groups)
     if _unimodality_reported.get() or X.shape[1] > 1 or len(counts) < 2 or counts.min() < 2:
         return
@@ -236,24 +233,6 @@ def warn_if_identical(training: TrainingSet) -> None:
             "from it is used.",
             DataRankWarning,
         )
-
-
-def warn_of_residuals(fit: HeteroscedasticFit, given: Tensor) -> None:
-    """Warn if rows ``given`` in this order without groups look like demonstrations, or the mean misses a signal."""
-    if fit.group is None and are_copies(fit.whitened(), fit.training, given):
-        message = (
-            "y has rows that nearly repeat those beside them along X, as samples of a demonstration do. Without groups "
-            "they count as independent, and what is predicted is far too certain. Give groups, the demonstration of "
-            "each row, to fit; cross_val_score takes params={'groups': groups}, and a search passes them on where "
-            "metadata routing is enabled and set_fit_request(groups=True) asks for them."
-        )
-        checks.warn(message, DataRankWarning)
-    elif bool((missed := fit.missed()).any()):
-        message = (
-            f"The mean does not follow y in outputs {missed.nonzero().flatten().tolist()}: what is left is no noise, "
-            "but counts as such. Raise n_inducing and max_inputs; give groups if the rows are of demonstrations."
-        )
-        checks.warn(message)
 
 
 def fit_with_groups(regressor: Any, X: ArrayLike, y: ArrayLike, groups: ArrayLike) -> Any:
