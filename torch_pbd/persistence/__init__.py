@@ -6,8 +6,11 @@ movement, and under "covariance_" all that of its regressor. A model of movement
 regressor of its own, if it has one, under "regressor_".
 """
 
+import hashlib
+import json
 import os
 import re
+import struct
 import warnings
 from collections.abc import Mapping
 from importlib.metadata import version
@@ -15,19 +18,27 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from safetensors.numpy import load as from_bytes
+from safetensors.numpy import save as to_bytes
 from sklearn.utils.validation import check_is_fitted
 
 from torch_pbd import checks
 from torch_pbd.control.controller import DMPController
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.exceptions import ModelFileError
-from torch_pbd.files import LOADERS, Arrays, read_checksummed, write_checksummed
+from torch_pbd.files import LOADERS, Arrays, replacing
+from torch_pbd.files.memory import require_memory
 from torch_pbd.persistence import plain
 from torch_pbd.registry import ESTIMATORS, MOVEMENTS, REGRESSORS
 
 FORMAT_VERSION = 1
 _KEY = "torch_pbd"
 _PARTS = {"DMPController": "covariance_", **dict.fromkeys(MOVEMENTS, "regressor_")}  # models that others consist of
+MAX_HEADER_BYTES = 2**22
+"""Longest JSON header that is written or read, about 200 000 numbers: lists in it take up to 20 times the memory."""
+
+_MAX_OUTER_BYTES = 4 * MAX_HEADER_BYTES  # the header of safetensors, in which ours is a string with escapes
+_COPIES = 3.0  # the file, the arrays in it, and one array's bytes under the checksum
 _FOREIGN = re.compile(
     r"\.(pkl|pickle|joblib|skops|pt|pth|ckpt|bin|onnx|np[yz]|h5|hdf5|mat|zip|json|ya?ml|toml|csv|txt|parquet)", re.I
 )
@@ -69,7 +80,7 @@ def save(estimator: CovarianceRegressor | DMPController, path: str | os.PathLike
         raise ValueError(f"the {name} cannot be saved, as it is not sound: {_brief(error)}.") from error
     versions = {package: version(package) for package in ("torch", "scikit-learn", "numpy")}
     header = {"format_version": FORMAT_VERSION, **description, "versions": versions}
-    write_checksummed(Path(path), _KEY, header, arrays)
+    write_archive(Path(path), header, arrays)
 
 
 def load(path: str | os.PathLike[str]) -> Any:
@@ -90,7 +101,7 @@ def load(path: str | os.PathLike[str]) -> Any:
     """
     path = Path(path)
     try:
-        header, arrays = read_checksummed(path, _KEY, FORMAT_VERSION)
+        header, arrays = read_archive(path)
     except ModelFileError as error:
         if not _FOREIGN.fullmatch(path.suffix):
             raise
@@ -98,7 +109,7 @@ def load(path: str | os.PathLike[str]) -> Any:
     try:
         if not isinstance(header.pop("versions", None), dict):
             raise ValueError("it does not say what wrote it")
-        del header["format_version"]  # which is known to be this one
+        del header["format_version"]
         return _restored(header, arrays)
     except Exception as error:
         what = f"{header.get('class')!s:.80}"
@@ -198,3 +209,73 @@ def _check_numbers(name: str, array: Any) -> None:
         (factor != np.tril(factor)).any() or (np.diagonal(factor) <= 0.0).any()
     ):
         raise ValueError(f"array {name!r:.80} must be the lower factor of a positive definite matrix")
+
+
+def write_archive(path: Path, header: Mapping[str, Any], arrays: Arrays) -> None:
+    """Write arrays of numbers, and a header of what JSON can hold with a checksum, to a file that is there whole."""
+    whole = {name: np.asarray(array, order="C") for name, array in arrays.items()}
+    # Through JSON once: the checksum is of what will be read again, lists where there were tuples.
+    plain = json.loads(json.dumps(dict(header)))
+    text = json.dumps({**plain, "sha256": _digest(plain, whole)})
+    if len(text) > MAX_HEADER_BYTES:
+        raise ValueError(
+            f"the header of {path} has {len(text)} bytes, must have at most {MAX_HEADER_BYTES}: keep long lists as "
+            "arrays."
+        )
+    with replacing(path) as file:
+        file.write(to_bytes(whole, metadata={_KEY: text}))
+
+
+def read_archive(path: Path) -> tuple[dict[str, Any], Arrays]:
+    """Header, less its checksum, and arrays of a file that :func:`write_archive` wrote; nothing is executed.
+
+    A ModelFileError tells of another kind or format, of a file that the memory cannot take, or that is not as it was
+    written: to the byte, but for the spelling of what safetensors says of the arrays.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"no model file at {path}")
+    try:
+        require_memory(_COPIES * path.stat().st_size, what=f"{path}", remedy="Read it where there is more.")
+    except ValueError as error:
+        raise ModelFileError(str(error)) from error
+    try:
+        # Not mapped into memory, as safe_open would: a file that shrinks while it is read would end the process.
+        text, arrays = _unpacked(path.read_bytes())
+        header = json.loads(text)
+        # The checksum is of the content: another spelling of it would have the same.
+        if json.dumps(header) != text:
+            raise ValueError("its header is not as it was written")
+    except Exception as error:  # parsers of bytes that are not what they claim to be raise errors of all kinds
+        what = f"{str(error) or type(error).__name__:.200}"
+        raise ModelFileError(f"{path} is not a model of {_KEY}, or is damaged ({what}).") from error
+    found = header.get("format_version") if isinstance(header, dict) else None
+    if type(found) is not int or found != FORMAT_VERSION:
+        raise ModelFileError(
+            f"{path} has format version {found!s:.40}; this torch_pbd reads {FORMAT_VERSION}. Upgrade it."
+        )
+    if header.pop("sha256", None) != _digest(header, arrays):
+        raise ModelFileError(f"{path} is damaged: it does not match its checksum.")
+    return header, arrays
+
+
+def _unpacked(content: bytes) -> tuple[str, Arrays]:
+    """Our header as text, and the arrays: their bytes are as many as their shapes need."""
+    (length,) = struct.unpack_from("<Q", content)
+    if length > _MAX_OUTER_BYTES:
+        raise ValueError(f"it declares a header of {length} bytes")
+    arrays: Arrays = from_bytes(content)
+    # Metadata, texts by their names, are read by safe_open alone. By now this is known to be a sound header.
+    metadata = json.loads(content[8 : 8 + length]).get("__metadata__", {})
+    if set(metadata) != {_KEY}:
+        raise ValueError(f"it is not marked {_KEY!r}")
+    if len(metadata[_KEY]) > MAX_HEADER_BYTES:
+        raise ValueError(f"its header is longer than {MAX_HEADER_BYTES} bytes")
+    return metadata[_KEY], arrays
+
+
+def _digest(header: dict[str, Any], arrays: Arrays) -> str:
+    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
+    for name in sorted(arrays):
+        digest.update(f"{name} {arrays[name].dtype} {arrays[name].shape} ".encode())
+        digest.update(arrays[name].tobytes())
+    return digest.hexdigest()
