@@ -249,7 +249,7 @@ def test_a_goal_changes_at_run_time_without_overshoot(controller):
 
 
 def test_a_plant_of_another_mass_is_told_of_and_a_noisy_sensor_is_seeded(controller):
-    with pytest.warns(UserWarning, match=r"mass=2\.0 kg.* damping_ratio was met for, mass=1 kg"):
+    with pytest.warns(UserWarning, match=r"mass=2\.0 kg.* damping_ratio was met for mass=1 kg"):
         controller.simulate(AdmittancePlant(2.0), rate=50.0)
     noisy = AdmittancePlant(sensor=ForceSensor.jr3())
     runs = [controller.simulate(noisy, rate=50.0, random_state=seed).position for seed in (0, 0, 1)]

@@ -227,7 +227,7 @@ def test_a_schedule_from_a_file_is_run_as_its_rows_are(tmp_path):
 
 
 def test_a_plant_of_another_mass_is_told_of():
-    with pytest.warns(UserWarning, match=r"mass=2\.0 kg.* damping_ratio was met for, mass=1 kg"):
+    with pytest.warns(UserWarning, match=r"mass=2\.0 kg.* damping_ratio was met for mass=1 kg"):
         simulate_many(turning_schedule(), 2, plant=AdmittancePlant(2.0))
 
 
@@ -322,7 +322,7 @@ def test_a_schedules_inertia_is_compared_with_that_of_the_plant():
     schedule = pose_schedule(31)
     for mass in (None, schedule.mass, lambda time: schedule.mass):
         simulate_many(schedule, 2, plant=AdmittancePlant(mass), duration=0.1, random_state=0)  # warnings are errors
-    with pytest.warns(UserWarning, match="mass=.* was met for, that of the schedule, off by up to 10%"):
+    with pytest.warns(UserWarning, match="mass=.* was met for the inertia of the schedule, off by up to 10%"):
         simulate_many(schedule, 2, plant=AdmittancePlant(1.1 * schedule.mass), duration=0.1)
     with pytest.warns(UserWarning, match="mass=<function .* has another mass"):
         simulate_many(schedule, 2, plant=AdmittancePlant(lambda time: 2.0), duration=0.1)

@@ -95,7 +95,7 @@ def test_an_inertia_moves_as_the_plant_of_torch(rng):
 def test_another_inertia_than_that_of_the_schedule_is_told():
     schedule, inertia = make_pose_schedule(0.01), arm_inertia(np.zeros(1))[0]
     for mass in (inertia, 5.0):
-        with pytest.warns(UserWarning, match="but damping_ratio was met for the 6 x 6 inertia of the schedule"):
+        with pytest.warns(UserWarning, match="but damping_ratio was met for the inertia of the schedule"):
             RealTimeAdmittance(schedule, mass=mass)
     with pytest.warns(UserWarning, match="but damping_ratio was met for mass=1 kg"):
         RealTimeAdmittance(make_pose_schedule(0.01, inertia=1.0), mass=inertia)
@@ -103,7 +103,7 @@ def test_another_inertia_than_that_of_the_schedule_is_told():
     RealTimeAdmittance(schedule)
     for mass, words in [
         (np.eye(3), r"mass has shape \(3, 3\), must have shape \(6, 6\)"),
-        (-inertia, "smallest eigenvalue of mass is .* positive definite"),
+        (-inertia, "smallest eigenvalue of mass.* is .* positive definite"),
     ]:
         with pytest.raises(ValueError, match=words):
             RealTimeAdmittance(schedule, mass=mass)

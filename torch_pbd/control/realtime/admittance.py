@@ -21,7 +21,7 @@ from torch_pbd.control.realtime.limits import (
 )
 from torch_pbd.control.realtime.motion import Motion
 from torch_pbd.control.realtime.steps import Vector
-from torch_pbd.control.realtime.table import ScheduleTable, virtual_mass
+from torch_pbd.control.realtime.table import ScheduleTable
 from torch_pbd.control.schedule import Schedule
 
 _FINE = TickStatus(0)  # made once: to make one takes a third of a tick
@@ -139,11 +139,10 @@ class RealTimeAdmittance:
         given |= {"force_rate_limit": force_rate_limit, "velocity_limit": velocity_limit}
         given |= {"acceleration_limit": acceleration_limit, "approach_speed": approach_speed}
         options = options_of_blocks(given | {"stop_deceleration": stop_deceleration}, len(schedule.blocks))
-        self._mass = virtual_mass(schedule, mass)
         rate = checks.number(rate, "rate", above=0.0, unit="1/s")
         self._channel = ForceChannel(options, schedule.blocks, hold_ticks)
         steady = stiffness_filter is not None
-        self._table = table = ScheduleTable(schedule, self._mass, rate, options["spring_limit"], steady=steady)
+        self._table = table = ScheduleTable(schedule, mass, rate, options["spring_limit"], steady=steady)
         self._clock = ScheduleClock(table, options, soft_start, on_gap)
         self._motion = Motion(table, self._clock, options, stiffness_filter, max_step, max_bad_ticks)
         self._is_pose, self._turn = len(table.blocks) == 2, threading.Lock()
@@ -151,7 +150,8 @@ class RealTimeAdmittance:
         self._motion.last = math.nan  # the robot's own start is still to come
 
     def __repr__(self) -> str:
-        mass = f"{self._mass:g} kg" if isinstance(self._mass, float) else str(self._mass.shape[-2:])
+        one = self._table.one_mass
+        mass = str(self._table.mass.shape[1:]) if one is None else f"{one:g} kg"
         return (
             f"RealTimeAdmittance(n_axes={self._table.n_axes}, mass={mass}, rate={self._table.rate:g} Hz, "
             f"schedule_time={self.schedule_time:.6g}..{self._table.end:.6g} s, faults={self.faults})"

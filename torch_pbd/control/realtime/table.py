@@ -3,6 +3,7 @@
 import math
 import struct
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, final
 
 import numpy as np
@@ -11,7 +12,7 @@ from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control.realtime.steps import State, Vector, advance_plane, along_modes, coupled, deviation, moved
 from torch_pbd.control.schedule import Schedule
-from torch_pbd.control.schedule.rows import Between, count_rows, row_times
+from torch_pbd.control.schedule.rows import Between, count_rows, row_times, warn_of_another_mass
 
 Scale = float | Vector
 """Scale of the stiffness: that of all, or those of positions and of rotations."""
@@ -19,26 +20,6 @@ Scale = float | Vector
 _LIGHTEST = 1e-50  # kg: float64 holds products of gains with masses from this one to its inverse
 _SINGULAR = 1e-12  # damping that counts as singular, relative to its largest entry in the same units
 _MAX_ROWS = 4_000_000  # an hour at 1 kHz, which takes 670 MB for d = 2
-
-
-def virtual_mass(schedule: Schedule, given: Any) -> float | Floats:
-    """Virtual mass, by default that of the schedule; another mass raises a warning.
-
-    A number in kg, or an array (d, d), or (n, d, d) where rows differ.
-    """
-    own, d = schedule.mass, schedule.n_outputs
-    mass: Any = given if given is not None else 1.0 if own is None else own
-    if np.ndim(mass) == 0:
-        mass = checks.number(mass, "mass", least=_LIGHTEST, most=1.0 / _LIGHTEST, unit="kg")
-    elif given is not None:
-        mass = checks.array(mass, "mass", (d, d))
-        checks.semidefinite(mass, "mass", definite=True)
-    if own is not None:
-        used, wanted = (each * np.eye(d) if np.ndim(each) == 0 else each for each in (mass, own))
-        if not np.all(used == wanted):
-            of = f"mass={own:g} kg" if isinstance(own, float) else f"the {d} x {d} inertia of the schedule"
-            checks.warn(f"mass is {given}, but damping_ratio was met for {of}: give both the same.")
-    return mass
 
 
 @final
@@ -55,8 +36,12 @@ class ScheduleTable:
     mobility: Floats
 
     def __init__(
-        self, schedule: Schedule, mass: float | Floats, rate: float, pull_limits: Vector, *, steady: bool = False
+        self, schedule: Schedule, mass: Any, rate: float, pull_limits: Vector, *, steady: bool = False
     ) -> None:
+        if mass is not None:
+            schedule, own = replace(schedule, mass=mass), schedule
+            warn_of_another_mass(own, np.asarray(schedule.mass), "mass is another")
+        mass = 1.0 if schedule.mass is None else schedule.mass
         duration = schedule.duration
         if count_rows(duration, rate) > _MAX_ROWS:
             must = f"at most {_MAX_ROWS / duration:g} for a schedule of {duration:g} s, a table of {_MAX_ROWS} rows"
@@ -71,11 +56,12 @@ class ScheduleTable:
         self.twist = slice(self.n_place, self.n_place + self.n_axes)
         self.velocity, self.acceleration = velocity.copy(), np.diff(velocity, axis=0) / np.diff(grid)[:, np.newaxis]
         velocity[-1] = 0.0
-        self._one_mass = mass if isinstance(mass, float) else None
         one = mass * np.eye(self.n_axes) if isinstance(mass, float) else mass
+        self.one_mass = mass if isinstance(mass, float) else None
+        checks.number(self.one_mass, "mass", least=_LIGHTEST, most=1.0 / _LIGHTEST, unit="kg", optional=True)
         masses = between.linear(one) if one.ndim == 3 else one[np.newaxis]
         self.mass = np.broadcast_to(masses, self.stiffness.shape)
-        modes = _shared_modes(self.stiffness, self.damping, masses, self._one_mass)
+        modes = _shared_modes(self.stiffness, self.damping, masses, self.one_mass)
         springs = self._springs(modes, pull_limits, steady)
         # Rows are packed, for the garbage collector would hold up the loop to walk over a list of a million rows.
         rows = np.concatenate([part.reshape(len(grid), -1) for part in (place, velocity, *springs)], axis=1)
@@ -83,7 +69,7 @@ class ScheduleTable:
 
     def _springs(self, modes: Sequence[Floats] | None, pull_limits: Vector, steady: bool) -> list[Floats]:
         """Columns of each row that a tick needs besides the motion."""
-        blocks, mass = self.blocks, self._one_mass
+        blocks, mass = self.blocks, self.one_mass
         is_apart = len(blocks) == 2 and _are_apart(self.stiffness, *blocks)
         self.springs, self._are_shared = blocks if is_apart else (slice(0, self.n_axes),), modes is not None
         self._is_plane = modes is not None and mass is not None and self.n_place == self.n_axes == 2
@@ -131,7 +117,7 @@ class ScheduleTable:
         stiffness, damping = (self.stiffness[index], self.damping[index]) if gains is None else gains
         scales = self.scales(row, stiffness, np.array(off))
         stiffness = self.along_axes(scales)[:, np.newaxis] * stiffness
-        move, velocity = coupled(stiffness, damping, self._one_mass or self.mass[index], push, off, motion, step)
+        move, velocity = coupled(stiffness, damping, self.one_mass or self.mass[index], push, off, motion, step)
         return (moved(place, move), velocity), scales[0] if scales[0] == scales[-1] else scales
 
     def scales(self, row: Vector, stiffness: Floats, off: Floats) -> Vector:
@@ -146,14 +132,14 @@ class ScheduleTable:
 
     def forced(self, acceleration: Vector, index: int) -> Vector:
         """Force that causes an acceleration."""
-        if self._one_mass is not None:
-            return tuple([self._one_mass * part for part in acceleration])
+        if self.one_mass is not None:
+            return tuple([self.one_mass * part for part in acceleration])
         return tuple((self.mass[index] @ acceleration).tolist())
 
     def accelerated(self, force: Vector, index: int) -> Vector:
         """Acceleration that a force causes."""
-        if self._one_mass is not None:
-            return tuple([part / self._one_mass for part in force])
+        if self.one_mass is not None:
+            return tuple([part / self.one_mass for part in force])
         return tuple(np.linalg.solve(self.mass[index], force).tolist())
 
 

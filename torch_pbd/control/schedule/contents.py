@@ -52,7 +52,9 @@ def checked_fields(fields: Mapping[str, Any]) -> dict[str, Any]:
         raise InvalidParameterError(f"position has shape {position.shape}, must have at least 2 rows, 1 column.")
     sizes = {"n": n, "p": p, "d": p if fields["orientation"] is None else p + 3}
     mass: Any = fields["mass"]
-    of_rows = np.broadcast_to(mass, (n, *np.shape(mass))) if np.ndim(mass) == 2 else mass if np.ndim(mass) else None
+    of_rows = mass if np.ndim(mass) else None
+    if np.ndim(mass) == 2:
+        of_rows = np.broadcast_to(checks.array(mass, "mass", (sizes["d"], sizes["d"])), (n, sizes["d"], sizes["d"]))
     given = {**fields, "mass": of_rows}
     arrays = {
         name: checks.array(given[name], name, [sizes.get(str(size), size) for size in shape]).copy()

@@ -16,6 +16,8 @@ from torch_pbd.files.memory import require_memory
 # Share of a tick that counts as rounding: 10 s at 1 kHz are 10001 rows, however 10 * 1000 is rounded, and time stamps
 # resolve a duration to a thousandth of their spacing, so that a shorter last interval counts as none.
 _ROUNDING = 1e-3
+# Share of a mass that counts as equal: functions of time are not linear between rows, and damping ratios vary by half.
+_SAME_MASS = 1e-3
 UNEVEN = 1e-6
 """Share of a tick that counts as rounding of its length: times of an hour at 1 kHz err by 5e-10 of one in float64."""
 
@@ -125,6 +127,23 @@ def damped_rows(schedule: Any, damping_ratio: float, law: Any) -> dict[str, Any]
     squared, axes = np.linalg.eigh(np.linalg.solve(factor, half.swapaxes(1, 2)))
     modes = factor @ axes * squared.clip(0.0)[:, np.newaxis] ** 0.25
     return rows | {"damping": 2.0 * ratio * modes @ modes.swapaxes(1, 2)}
+
+
+def warn_of_another_mass(schedule: Any, mass: Floats, who: str) -> None:
+    """Warn if a mass, (), (d, d) or (n, d, d), is not that which the damping of a schedule was computed for."""
+    if schedule.mass is None:
+        return
+    identity = np.eye(schedule.n_outputs)
+    own, used = (each if np.ndim(each) else each * identity for each in (schedule.mass, mass))
+    # Entries are compared in units of their axes.
+    root = np.sqrt(np.diagonal(own, axis1=-2, axis2=-1))
+    off = float(np.max(np.abs(used - own) / (root[..., np.newaxis] * root[..., np.newaxis, :])))
+    if off > _SAME_MASS:
+        met = f"mass={schedule.mass:g} kg" if isinstance(schedule.mass, float) else "the inertia of the schedule"
+        checks.warn(
+            f"{who}, but damping_ratio was met for {met}, off by up to {off:.0%}: give both the same, or mass=None, "
+            "which is the schedule's."
+        )
 
 
 def turned_rows(schedule: Any, rotation: ArrayLike, translation: ArrayLike | None) -> dict[str, Any]:

@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.control.matrices import mass_rows
-from torch_pbd.control.schedule.rows import even_step
+from torch_pbd.control.schedule.rows import even_step, warn_of_another_mass
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.plant import AdmittancePlant
 from torch_pbd.control.simulation.rollout import Rollout, run_task, warn_if_far
@@ -20,9 +19,6 @@ from torch_pbd.control.simulation.ticks import Task, block_length
 from torch_pbd.files.memory import require_memory
 
 Range = float | tuple[float, float]
-
-# Share of a mass that counts as equal: functions of time are not linear between rows, and damping ratios vary by half.
-_SAME_MASS = 1e-3
 
 
 def simulate(
@@ -176,17 +172,8 @@ def _task_of(schedule: Schedule, plant: AdmittancePlant | None) -> Task:
     given: dict[str, Any] = {name: torch.tensor(row) for name, row in more.items() if row is not None}
     given |= {"times": schedule.time, "dt": even_step(schedule.time), "own_mass": schedule.mass}
     task = plant.task(position, velocity, stiffness, damping, **given)
-    if schedule.mass is not None and plant.mass is not None:
-        own = mass_rows(schedule.mass, stiffness)
-        # Entries are compared in units of their axes.
-        root = own.diagonal(dim1=-2, dim2=-1).sqrt()
-        off = float(((task.mass - own).abs() / (root.unsqueeze(-1) * root.unsqueeze(-2))).max())
-        if off > _SAME_MASS:
-            met = f"mass={schedule.mass:g} kg" if isinstance(schedule.mass, float) else "that of the schedule"
-            checks.warn(
-                f"{plant} has another mass than its damping_ratio was met for, {met}, off by up to {off:.0%}: give "
-                "both the same, or mass=None, which is the schedule's."
-            )
+    if plant.mass is not None:
+        warn_of_another_mass(schedule, task.mass.detach().numpy(), f"{plant} has another mass")
     return task
 
 
