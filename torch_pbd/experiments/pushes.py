@@ -58,17 +58,15 @@ def push(
 ) -> Run:
     """Plan, push early and late, and certify; ``peak`` in N, ``torque`` in Nm, the arm's inertia for poses only."""
     planned = controller.schedule(rate)
-    if planned.orientation is None:
-        force = push_profile(planned.time, controller.duration_, peak, controller.n_outputs_)
-        still, pushed = controller.simulate(rate=rate), controller.simulate(force=force, rate=rate)
-        return Run(controller, planned, planned, still, {"force": [pushed]}, planned.certify())
-    schedule = with_panda(planned) if arm == "panda" else planned
-    # As torque control of an arm, which feeds its inertia times the acceleration forward.
-    run = partial(simulate, schedule, plant=AdmittancePlant(None, feed_forward=True))
-    pushes = {
-        kind.push: [run(_wrench(schedule, largest, kind, axis)) for axis in range(3)]
-        for kind, largest in zip(KINDS, (peak, torque), strict=True)
-    }
+    is_pose = planned.orientation is not None
+    schedule = with_panda(planned) if is_pose and arm == "panda" else planned
+    # As torque control of an arm, which feeds its inertia times the acceleration forward, or as an admittance.
+    run = partial(simulate, schedule, plant=AdmittancePlant(None, feed_forward=is_pose))
+    forces = {"force": [push_profile(planned.time, controller.duration_, peak, controller.n_outputs_)]}
+    if is_pose:
+        largest = zip(KINDS, (peak, torque), strict=True)
+        forces = {kind.push: [_wrench(schedule, most, kind, axis) for axis in range(3)] for kind, most in largest}
+    pushes = {push: [run(force) for force in each] for push, each in forces.items()}
     return Run(controller, planned, schedule, run(), pushes, schedule.certify())
 
 
