@@ -42,9 +42,9 @@ def test_events_of_a_pointer_that_share_a_time_or_go_back_are_one():
     rows[0].insert(10, [rows[0][9][0], 0.5, 0.5])
     rows[0].insert(20, [rows[0][3][0], 0.5, 0.5])
     first, _ = messages.as_strokes(rows)
-    assert len(first.time) == len(rows[0]) - 2
-    assert first.time[0] == 0.0
-    assert (np.diff(first.time) > 0).all()
+    assert len(first) == len(rows[0]) - 2
+    assert first[0, 0] == 0.0
+    assert (np.diff(first[:, 0]) > 0).all()
 
 
 @pytest.mark.parametrize(

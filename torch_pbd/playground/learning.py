@@ -13,9 +13,10 @@ import numpy as np
 import yaml
 from sklearn.frozen import FrozenEstimator
 
+from torch_pbd.checks import Floats
 from torch_pbd.control import DMPController, Schedule, StiffnessLaw
 from torch_pbd.data import Demonstrations, load_demonstrations, save_demonstrations
-from torch_pbd.playground.messages import Settings, Stroke
+from torch_pbd.playground.messages import Settings
 from torch_pbd.registry import MOVEMENTS, load_class
 
 _STEPS, _DRAWN = 40, 50  # at which a movement is learned and drawn: the bends of strokes are a tenth of them
@@ -41,9 +42,9 @@ class Learned:
     scores: dict[tuple[str, int], float] = field(default_factory=dict)
 
 
-def learn(strokes: list[Stroke], settings: Settings) -> Learned:
+def learn(strokes: list[Floats], settings: Settings) -> Learned:
     """Steps that learn models of two strokes or more, the schedule of the first, and how likely left-out ones are."""
-    times, positions = zip(*strokes, strict=True)
+    times, positions = [rows[:, 0] for rows in strokes], [rows[:, 1:] for rows in strokes]
     learned = Learned(Demonstrations(times, positions, names=["x", "y"], units="m"), settings)
     left_out = range(len(strokes)) if len(strokes) > 2 else ()
     learned.steps.extend(partial(_fit, learned, name) for name in settings.models)
@@ -133,7 +134,7 @@ def take_home(learned: Learned, name: str) -> bytes:
         return path.read_bytes()
 
 
-def read_file(name: str, content: bytes) -> list[Stroke]:
+def read_file(name: str, content: bytes) -> list[list[list[float]]]:
     """Strokes of a file of demonstrations, .csv or .npz, of two outputs; its name is used for its ending alone."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, f"dropped{Path(name).suffix.lower()}")
@@ -141,7 +142,7 @@ def read_file(name: str, content: bytes) -> list[Stroke]:
         demonstrations = load_demonstrations(path)
     if demonstrations.n_outputs != 2:
         raise ValueError(f"{name} has {demonstrations.n_outputs} outputs, must have 2: leave the others out.")
-    return [Stroke(each.time - each.time[0], each.position) for each in demonstrations]
+    return [np.column_stack(each).tolist() for each in demonstrations.from_start()]
 
 
 def _model(name: str) -> Any:

@@ -3,7 +3,7 @@
 import base64
 import json
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -21,13 +21,6 @@ MOST_BYTES = 2**21  # largest message, above forty strokes of a minute at 60 Hz
 _MOST_STROKES, _MOST_SAMPLES, _MOST_POINTS = 40, 4000, 12
 _FARTHEST = 10.0  # m
 _LEAST_STEP = 1e-4  # s: events of a pointer that share a millisecond are one
-
-
-class Stroke(NamedTuple):
-    """Times (T,) in s from its start, and positions (T, 2) in m."""
-
-    time: Floats
-    position: Floats
 
 
 @dataclass(frozen=True)
@@ -54,8 +47,8 @@ def parse(text: Any) -> dict[str, Any]:
     return message
 
 
-def as_strokes(values: Any) -> list[Stroke]:
-    """Strokes, each a list of rows (time in s, x in m, y in m); at least two, of at least five samples."""
+def as_strokes(values: Any) -> list[Floats]:
+    """Strokes, each of rows (time in s from its start, x in m, y in m); at least two, of at least five samples."""
     if not isinstance(values, list) or not 2 <= len(values) <= _MOST_STROKES:
         raise ValueError(f"strokes must be a list of 2 to {_MOST_STROKES}: draw the movement again, a bit differently.")
     strokes = []
@@ -69,7 +62,7 @@ def as_strokes(values: Any) -> list[Stroke]:
         samples = samples[np.append(True, np.diff(np.maximum.accumulate(samples[:, 0])) > _LEAST_STEP)]
         if len(samples) < 5:
             raise ValueError(f"{name} has fewer than 5 different times: draw it more slowly.")
-        strokes.append(Stroke(samples[:, 0] - samples[0, 0], samples[:, 1:]))
+        strokes.append(samples - [samples[0, 0], 0.0, 0.0])
     return strokes
 
 

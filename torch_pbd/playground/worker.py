@@ -13,8 +13,6 @@ from multiprocessing.connection import Connection
 from queue import SimpleQueue
 from typing import Any
 
-import numpy as np
-
 Answer = dict[str, Any]
 
 
@@ -153,8 +151,7 @@ class Desk:
             self._fits[tab] = learning.learn(request["strokes"], request["settings"])
             return None
         if kind == "read":
-            strokes = learning.read_file(request["name"], request["content"])
-            return {"type": "strokes", "strokes": [np.column_stack(stroke).tolist() for stroke in strokes]}
+            return {"type": "strokes", "strokes": learning.read_file(request["name"], request["content"])}
         if learned is None:
             raise ValueError("nothing is learned yet: draw two strokes.")
         if kind == "take":
