@@ -89,10 +89,6 @@ def certify(
         for i, block in enumerate((slice(None), block, block) for block in schedule.blocks):
             gains = stiffness[block], damping[block], inertia[block][0]
             pressed[i] = stiffest_environment(*gains, loop, force_cutoff, dt)
-    # One number, one matrix, or None where the rows differ.
-    number, identity = float(inertia[0, 0, 0]), torch.eye(inertia.shape[-1]).to(inertia)
-    is_number = torch.equal(inertia[0], number * identity)
-    shown = None if len(inertia) > 1 else number if is_number else tuple(map(tuple, inertia[0].tolist()))
     eigenvalues = [torch.linalg.eigvalsh(inertia[:, block, block]) for block in schedule.blocks]
     return StabilityReport(
         damping_ratio=_damping_ratio(dynamics),
@@ -110,8 +106,8 @@ def certify(
         environment_stiffness=pressed[0],
         environment_rotation=pressed[1],
         speed=float(speed),
-        mass=shown,
         inertia=tuple((float(each.min()), float(each.max())) for each in eigenvalues),
+        is_constant=len(inertia) == 1,
         units=tuple("Nm/rad" if i or schedule.units == "rad" else "N/m" for i in range(len(schedule.blocks))),
     )
 

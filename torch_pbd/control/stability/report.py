@@ -66,10 +66,10 @@ class StabilityReport:
         with its position loop. NaN for a varying inertia, as an arm's own, and for the second without an orientation.
     speed : float
         Replay speed.
-    mass : float, tuple of rows, or None
-        Inertia in kg, for poses also kg m and kg m^2; None if it varies.
     inertia : tuple of (float, float)
         Smallest and largest inertia of the positions in kg, and of the rotation in kg m^2.
+    is_constant : bool
+        Whether one inertia is that of all rows.
     units : tuple of str
         Units of the stiffness of positions and of the rotation.
     """
@@ -89,8 +89,8 @@ class StabilityReport:
     environment_stiffness: float
     environment_rotation: float
     speed: float
-    mass: float | tuple[tuple[float, ...], ...] | None
     inertia: tuple[tuple[float, float], ...]
+    is_constant: bool
     units: tuple[str, ...]
 
     @property
@@ -134,18 +134,18 @@ class StabilityReport:
         return "\n".join([head, *lines])
 
     def _robot(self) -> str:
-        kilograms = ["kg m^2" if unit == "Nm/rad" else "kg" for unit in self.units]
-        if isinstance(self.mass, float):
-            return f"the admittance at {self.mass:g} {' and '.join(kilograms)}"
-        ranges = (f"{low:.3g} to {high:.3g} {unit}" for (low, high), unit in zip(self.inertia, kilograms, strict=True))
-        return f"{'an inertia that varies' if self.mass is None else 'a mass matrix'}, {' and '.join(ranges)}"
+        parts = []
+        for limits, unit in zip(self.inertia, self.units, strict=True):
+            shown = " to ".join(dict.fromkeys(f"{limit:.3g}" for limit in limits))  # one number where they are equal
+            parts.append(f"{shown} {'kg m^2' if unit == 'Nm/rad' else 'kg'}")
+        return f"{'the admittance at' if self.is_constant else 'an inertia that varies,'} {' and '.join(parts)}"
 
     def _any_schedule(self) -> str:
         holds = f"holds: in any order at a rate of {self.any_schedule_rate:.3g} /s"
         text = f"{holds if self.stable_at_any_schedule else 'does not hold'}; damping ratio {self.damping_ratio:.3g}"
         if math.isnan(self.stiffness_ratio):
             return (
-                f"{text}; no ratio is enough in itself for {'an inertia that varies' if self.mass is None else 'poses'}"
+                f"{text}; no ratio is enough in itself for {'poses' if self.is_constant else 'an inertia that varies'}"
             )
         return (
             f"{text}; one of {self.required_damping_ratio:.3g} will do for stiffness ratio {self.stiffness_ratio:.3g}"
