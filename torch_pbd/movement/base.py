@@ -12,12 +12,13 @@ from sklearn.utils.validation import check_is_fitted
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
+from torch_pbd.data.demonstrations import Demonstration
 from torch_pbd.estimators.base import Uncertainty, shaped_as_y
 from torch_pbd.estimators.door import by_chunks
 from torch_pbd.estimators.validation import checked_rows
 from torch_pbd.files.memory import require_much
 from torch_pbd.linalg import gaussian_log_density, student_log_density
-from torch_pbd.movement.law import MovementLaw, Recording, as_recordings, semidefinite_root
+from torch_pbd.movement.law import MovementLaw, as_recordings, semidefinite_root
 
 
 class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
@@ -63,7 +64,7 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         """Check the parameters, before any work."""
 
     @abstractmethod
-    def _fit(self, recordings: list[Recording]) -> None:
+    def _fit(self, recordings: list[Demonstration]) -> None:
         """Fit to two or more demonstrations."""
 
     def _components(self, time: Floats) -> tuple[Floats, list[tuple[Self, Floats]]]:

@@ -10,13 +10,14 @@ from sklearn.base import clone
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
+from torch_pbd.data.demonstrations import Demonstration
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.estimators.mixture import GMMBaseline
 from torch_pbd.estimators.validation import fit_with_groups
 from torch_pbd.files.memory import require_much
 from torch_pbd.movement.base import MovementRegressor
 from torch_pbd.movement.joint import Conditioned, JointNormal
-from torch_pbd.movement.law import Recording, as_rows, check_arrays, semidefinite_root
+from torch_pbd.movement.law import as_rows, check_arrays, semidefinite_root
 
 _ARRAYS = ("reference.time", "reference.mean", "reference.covariance", "range", "deviation")  # names in model files
 
@@ -76,7 +77,7 @@ class KMPBaseline(MovementRegressor):
             checks.number(getattr(self, name), name, above=0.0)
         checks.seed(self.random_state)
 
-    def _fit(self, recordings: list[Recording]) -> None:
+    def _fit(self, recordings: list[Demonstration]) -> None:
         X, y, groups = as_rows(recordings)
         regressor = GMMBaseline() if self.regressor is None else clone(self.regressor)
         self.regressor_ = fit_with_groups(regressor, X, y, groups)

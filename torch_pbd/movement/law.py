@@ -13,21 +13,14 @@ from torch import Tensor
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.data import Demonstrations
 from torch_pbd.data.alignment import TIMING_REMOVED
+from torch_pbd.data.demonstrations import Demonstration, Demonstrations
 from torch_pbd.estimators.validation import check_groups, checked_queries, checked_rows
 from torch_pbd.movement.joint import Conditioned, JointNormal
 
 _DECIMALS = 10  # decimals kept of a time over the range of the fit's times, so that 0.1 + 0.2 and 0.3 are equal
 _MOST_KEPT = 1024  # most times whose law is cached
 _MOST_ENTRIES = 4096  # most entries conditioned on one by one: a matrix of their number squared is factorized
-
-
-class Recording(NamedTuple):
-    """A demonstration: increasing times (T,) and positions (T, d)."""
-
-    time: Floats
-    position: Floats
 
 
 class Known(NamedTuple):
@@ -188,7 +181,7 @@ class MovementLaw(BaseEstimator, ABC):
         return {name: value for name, value in super().__getstate__().items() if name != "_kept"}
 
 
-def as_recordings(model: Any, X: Any, y: Any, groups: Any, *, is_fit: bool) -> list[Recording]:
+def as_recordings(model: Any, X: Any, y: Any, groups: Any, *, is_fit: bool) -> list[Demonstration]:
     """Demonstrations from the arguments of a model of movements, each in the order of its times.
 
     A fit sets the kind of its input, ``input_``, and the number of outputs, ``n_outputs_``.
@@ -224,10 +217,10 @@ def as_recordings(model: Any, X: Any, y: Any, groups: Any, *, is_fit: bool) -> l
     numbers = np.zeros(len(inputs), dtype=np.intp) if groups is None else check_groups(groups, len(inputs))
     order = np.lexsort([inputs[:, 0], numbers])
     parts = np.split(order, np.flatnonzero(np.diff(numbers[order])) + 1)
-    return [Recording(inputs[rows, 0], targets[rows]) for rows in parts]
+    return [Demonstration(inputs[rows, 0], targets[rows]) for rows in parts]
 
 
-def as_rows(recordings: list[Recording]) -> tuple[Floats, Floats, NDArray[np.intp]]:
+def as_rows(recordings: list[Demonstration]) -> tuple[Floats, Floats, NDArray[np.intp]]:
     """Rows of recordings for a regressor: X (n, 1), y (n, d) and their numbers (n,)."""
     times, positions = zip(*recordings, strict=True)
     numbers = np.repeat(np.arange(len(recordings)), [len(time) for time in times])

@@ -10,9 +10,10 @@ import torch
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
+from torch_pbd.data.demonstrations import Demonstration
 from torch_pbd.movement.base import MovementRegressor
 from torch_pbd.movement.joint import JointNormal
-from torch_pbd.movement.law import Recording, check_arrays, semidefinite_root
+from torch_pbd.movement.law import check_arrays, semidefinite_root
 
 _N_BASES = (8, 12, 16, 20)  # candidates of "auto", as far as recordings have enough samples
 _REACHES = (1.0, 2.0, 4.0)  # candidate length scales of the smooth prior, in bases
@@ -84,8 +85,8 @@ class ProMPBaseline(MovementRegressor):
         checks.number(self.ridge, "ridge", least=0.0)
         checks.seed(self.random_state)
 
-    def _fit(self, recordings: list[Recording]) -> None:
-        scaled = [Recording(self._scaled(time), position) for time, position in recordings]
+    def _fit(self, recordings: list[Demonstration]) -> None:
+        scaled = [Demonstration(self._scaled(time), position) for time, position in recordings]
         most = max(2, min(len(time) for time, _ in recordings) - 1)
         sizes = _N_BASES if self.n_basis == "auto" else (int(self.n_basis),)
         overlaps = _OVERLAPS if self.overlap == "auto" else (float(self.overlap),)
@@ -123,7 +124,7 @@ class ProMPBaseline(MovementRegressor):
 class _Weights:
     """Weights of each demonstration, and the statistics that score a covariance of them."""
 
-    def __init__(self, recordings: list[Recording], n_basis: int, overlap: float, ridge: float) -> None:
+    def __init__(self, recordings: list[Demonstration], n_basis: int, overlap: float, ridge: float) -> None:
         self.n_basis, self.overlap = n_basis, overlap
         self._samples = [(basis_functions(time, n_basis, overlap), position) for time, position in recordings]
         weights, residuals = [], []

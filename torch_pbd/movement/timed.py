@@ -12,9 +12,10 @@ from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.console import say
 from torch_pbd.data.alignment import interpolate
+from torch_pbd.data.demonstrations import Demonstration
 from torch_pbd.linalg import safe_cholesky, student_log_density
 from torch_pbd.movement.base import MovementRegressor
-from torch_pbd.movement.law import Known, Recording, check_arrays
+from torch_pbd.movement.law import Known, check_arrays
 from torch_pbd.movement.timing import Likelihood, Nodes, Timing, phases, register, time_of
 
 _FEWEST = 4  # demonstrations needed to estimate how duration and pace vary together
@@ -135,7 +136,7 @@ class TimedMovement(MovementRegressor):
 
         return log_likelihood
 
-    def _timed(self, recordings: list[Recording]) -> list[Recording]:
+    def _timed(self, recordings: list[Demonstration]) -> list[Demonstration]:
         """Recordings over the input of the law, once it is decided whether their timing varies."""
         self._timing, self.timing_ = None, self.timing
         if self.timing == "none":
@@ -153,7 +154,7 @@ class TimedMovement(MovementRegressor):
                 say(f"timing: a warp gains {self.timing_gain_:.3g} nats a step, taken is {self.timing_!r}")
         return self._phased(recordings, self.timing_)
 
-    def _phased(self, recordings: list[Recording], timing: str) -> list[Recording]:
+    def _phased(self, recordings: list[Demonstration], timing: str) -> list[Demonstration]:
         """Recordings over phase, after their timing was learned."""
         first, duration = (np.array([recording.time[i] for recording in recordings]) for i in (0, -1))
         good = (first >= 0.0) & (first < 0.5 * duration)
@@ -171,12 +172,12 @@ class TimedMovement(MovementRegressor):
         shared = np.linspace(0.0, 1.0, n_grid_steps(recordings))
         phased = []
         for (time, position), own in zip(recordings, pace, strict=True):
-            values = sampled(Recording(time / time[-1], position), time_of(torch.from_numpy(shared), own).numpy())
+            values = sampled(Demonstration(time / time[-1], position), time_of(torch.from_numpy(shared), own).numpy())
             seen = ~np.isnan(values).any(axis=1)
-            phased.append(Recording(shared[seen], values[seen]))
+            phased.append(Demonstration(shared[seen], values[seen]))
         return phased
 
-    def _gain(self, recordings: list[Recording]) -> float:
+    def _gain(self, recordings: list[Demonstration]) -> float:
         """Gain of a warp over the mean duration at an even pace, in nats per step of left-out demonstrations.
 
         Steps are a twelfth of a movement apart, as long as the movement runs under both.
@@ -228,12 +229,12 @@ def _spread(time: Floats, duration: float) -> NDArray[np.intp]:
     return np.unique(np.abs(time[:, np.newaxis] - even).argmin(axis=0))
 
 
-def n_grid_steps(recordings: list[Recording]) -> int:
+def n_grid_steps(recordings: list[Demonstration]) -> int:
     """Steps of the grid on which recordings are compared: their median number of samples, at most 200."""
     return max(2, min(_MOST_STEPS, round(float(np.median([len(recording.time) for recording in recordings])))))
 
 
-def sampled(recording: Recording, grid: Floats) -> Floats:
+def sampled(recording: Demonstration, grid: Floats) -> Floats:
     """Positions of a recording at the steps of a grid, linear between samples; NaN where no sample is near."""
     time, position = recording
     right = np.clip(np.searchsorted(time, grid), 1, len(time) - 1)

@@ -13,13 +13,14 @@ from torch import Tensor, nn
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
+from torch_pbd.data.demonstrations import Demonstration
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
 from torch_pbd.estimators.validation import fit_with_groups
 from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import safe_cholesky
 from torch_pbd.movement.joint import JointNormal
-from torch_pbd.movement.law import Recording, as_rows, check_arrays
+from torch_pbd.movement.law import as_rows, check_arrays
 from torch_pbd.movement.time_kernel import TimeKernel
 from torch_pbd.movement.time_kernel_fit import fit_time_kernel
 from torch_pbd.movement.timed import TimedMovement, n_grid_steps, sampled
@@ -152,7 +153,7 @@ class TrajectoryRegressor(TimedMovement):
         ):
             raise checks.refusal(self.regressor, "regressor", "a covariance regressor or None")
 
-    def _fit(self, recordings: list[Recording]) -> None:
+    def _fit(self, recordings: list[Demonstration]) -> None:
         for number, recording in enumerate(recordings):
             if len(recording.time) < 2 or not (np.diff(recording.time) > 0.0).all():
                 raise ValueError(
@@ -160,7 +161,7 @@ class TrajectoryRegressor(TimedMovement):
                 )
         self._fit_law(self._timed(recordings))
 
-    def _fit_law(self, recordings: list[Recording]) -> None:
+    def _fit_law(self, recordings: list[Demonstration]) -> None:
         X, y, groups = as_rows(recordings)
         regressor = HeteroscedasticGPRegressor() if self.regressor is None else clone(self.regressor)
         self.regressor_ = fit_with_groups(regressor, X, y.ravel() if self._y_is_1d else y, groups)
