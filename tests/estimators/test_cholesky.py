@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from scipy.special import gammaln
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
@@ -71,6 +72,34 @@ def test_noise_scale_is_in_units_of_y():
     whole = fit(CholeskyCovRegressor(noise_scale=0.2), X, y).predict_cov(X)
     in_mm = fit(CholeskyCovRegressor(noise_scale=200.0), X, 1e3 * y).predict_cov(X)
     np.testing.assert_allclose(in_mm / 1e6, whole, rtol=1e-5)
+
+
+@pytest.mark.parametrize("diagonal", ["raw", "log"])
+def test_bias_correction_divides_each_column_by_its_expectation(diagonal):
+    """Interpolated, so column i of every factor is larger by 1 / c_i (Bartlett)."""
+    X, y = demonstrations(3, n_demos=6)
+    plain, corrected = (
+        fit(CholeskyCovRegressor(noise_scale=0.0, diagonal=diagonal, bias_correction=b), X, y).predict_cov(X[:8])
+        for b in (False, True)
+    )
+    k, i = 6, np.arange(1, 4)
+    expectation = np.sqrt(2.0 / (k - 1)) * np.exp(gammaln((k - i + 1) / 2) - gammaln((k - i) / 2))
+    ratio = np.linalg.cholesky(corrected) / np.where(np.linalg.cholesky(plain) == 0, np.inf, np.linalg.cholesky(plain))
+    np.testing.assert_allclose(
+        ratio, np.tril(np.broadcast_to(1.0 / expectation, (3, 3)))[np.newaxis].repeat(8, 0), rtol=1e-6
+    )
+
+
+def test_bias_correction_makes_many_small_fits_right_on_average():
+    """Mean over 60 sets of 5 demonstrations of one output: the standard deviation is the true one, 1."""
+    deviations = []
+    for seed in range(60):
+        y = np.random.default_rng(seed).normal(size=(5, 8)).ravel()
+        X = np.tile(np.arange(8.0)[:, np.newaxis], (5, 1))
+        model = fit(CholeskyCovRegressor(noise_scale=0.0, length_scale=0.1, bias_correction=True, n_restarts=0), X, y)
+        deviations.append(model.predict(X[:8], return_std=True)[1].mean())
+    standard_error = np.std(deviations) / len(deviations) ** 0.5
+    assert abs(np.mean(deviations) - 1.0) < 4.0 * standard_error < 0.08
 
 
 @pytest.mark.parametrize("objective", ["empirical", "likelihood"])

@@ -14,7 +14,7 @@ PAPER = {"objective": "likelihood", "latent_prior": False}
 VARIANTS = {
     "cholesky": CholeskyCovRegressor(),
     "cholesky-interpolating": CholeskyCovRegressor(noise_scale=0.0),
-    "cholesky-log": CholeskyCovRegressor(diagonal="log"),
+    "cholesky-log": CholeskyCovRegressor(diagonal="log", bias_correction=True),
     "cholesky-likelihood": CholeskyCovRegressor(objective="likelihood"),
     "cholesky-likelihood-raw": CholeskyCovRegressor(objective="likelihood", diagonal="raw"),
     "cholesky-eq12": CholeskyCovRegressor(**PAPER, max_iter=50),

@@ -121,6 +121,7 @@ BAD_PARAMETERS = {
     "solver": ("adam", ValueError),
     "reg_covar": (0.0, ValueError),
     "latent_prior": ("False", ValueError),
+    "bias_correction": (None, ValueError),
 }
 
 

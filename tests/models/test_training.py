@@ -111,6 +111,16 @@ def test_few_rows_are_shrunk_to_the_pooled_covariance(d, n_rows, rng):
         assert (np.diag(tril[i]) > 0).all()
 
 
+@pytest.mark.parametrize(("d", "n_rows"), [(1, 2), (2, 3), (2, 6), (9, 10), (9, 30)])
+def test_bias_correction_divides_by_the_mean_of_a_chi_distribution(d, n_rows, rng):
+    """The entries of the factor's diagonal are chi distributed (Bartlett), K - 1 to K - d degrees of freedom."""
+    training = training_set([n_rows] * 3, d, rng)
+    raw, corrected = empirical_tril(training), empirical_tril(training, bias_correction=True)
+    degrees = n_rows - 1
+    expectation = chi(degrees - np.arange(d)).mean() / np.sqrt(degrees)
+    np.testing.assert_allclose(corrected * tensor(expectation), raw, rtol=1e-9, atol=1e-14)
+
+
 @pytest.mark.parametrize("max_inputs", [1, 4, 7])
 def test_merging_keeps_all_rows_and_their_total(max_inputs, rng):
     training = training_set([1, 2, 3, 4, 5, 6, 7, 8], 2, rng)

@@ -22,7 +22,7 @@ CANDIDATES: dict[str, list[CovarianceRegressor]] = {
         CholeskyCovRegressor(**_SHORT),
         CholeskyCovRegressor(**_SHORT, noise_scale=0.0),
         CholeskyCovRegressor(**_SHORT, kernel="matern32"),
-        CholeskyCovRegressor(**_SHORT, diagonal="log"),
+        CholeskyCovRegressor(**_SHORT, diagonal="log", bias_correction=True),
         CholeskyCovRegressor(**_LIKELIHOOD),
         CholeskyCovRegressor(**_LIKELIHOOD, diagonal="raw", solver="lbfgs", kernel="matern52"),
         CholeskyCovRegressor(**_PRINTED),

@@ -41,6 +41,9 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
         Whether the processes of the diagonal entries model the entries themselves, as in the paper, or their
         logarithms, which cannot cross zero between inputs. "auto" takes "raw" where ``noise_scale`` is given
         for "empirical", since it is the error of the entries themselves, and "log" otherwise.
+    bias_correction : bool, default=False
+        Divide the empirical factors by their expected share of the true ones for normal data (Bartlett). With few
+        demonstrations they are too small: by 5 and 16 % for six of two outputs. Only for "empirical".
     {common}
     loss_ : float
         Negative log marginal likelihood of the factors' entries, in nats, for "empirical"; negative log posterior
@@ -66,16 +69,18 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
 
     noise_scale: float | None = None
     diagonal: str = "auto"
+    bias_correction: bool = False
 
     def _check_parameters(self) -> None:
         super()._check_parameters()
         checks.number(self.noise_scale, "noise_scale", least=0.0, optional=True)
+        checks.flag(self.bias_correction, "bias_correction")
         checks.choice(self.diagonal, "diagonal", ("auto", "raw", "log"))
 
     def _fit_empirical(self, problem: Problem) -> tuple[MeanAndCholesky, FitReport, float]:
         training, smoothed = problem.training, self.noise_scale is None
         link = CholeskyLink(problem.prior_tril, self.diagonal == "log" or (self.diagonal == "auto" and smoothed))
-        scale_tril = empirical_tril(training)
+        scale_tril = empirical_tril(training, bias_correction=self.bias_correction)
         linked = scale_tril
         if link.log_diagonal:
             diagonal = scale_tril.diagonal(dim1=-2, dim2=-1)

@@ -123,11 +123,14 @@ def default_prior_tril(y: Tensor) -> Tensor:
     return 2.0 * scale_tril_from_root(torch.cat([centred, 0.001**0.5 * torch.eye(y.shape[1]).to(y)], dim=1))
 
 
-def empirical_tril(training: TrainingSet) -> Float[Tensor, "n d d"]:
+def empirical_tril(training: TrainingSet, *, bias_correction: bool = False) -> Float[Tensor, "n d d"]:
     """Factor of the empirical covariance at each distinct input; its divisor is the count less one.
 
     At an input with no more than d rows the scatter is singular. There it is shrunk towards the pooled
     covariance as by an inverse-Wishart prior of d + 1 degrees of freedom.
+
+    ``bias_correction`` divides column i of each factor that was not shrunk by its expectation for normal data
+    (Bartlett), ``sqrt(2 / (K - 1)) * gamma((K - i + 1) / 2) / gamma((K - i) / 2)``, i from 1.
     """
     n_outputs = training.y.shape[1]
     root = training.scatter_root(training.y - training.means()[training.index])
@@ -138,7 +141,14 @@ def empirical_tril(training: TrainingSet) -> Float[Tensor, "n d d"]:
         # The prior adds d + 1 times the pooled covariance to the scatter, by roots side by side, and d + 1 degrees.
         prior_root = prior_degrees**0.5 * pooled_tril(training) * lacking[:, None, None]
         root = torch.cat([root, prior_root], dim=-1)
-    return scale_tril_from_root(root) / (degrees + prior_degrees * lacking).sqrt()[:, None, None]
+    scale_tril = scale_tril_from_root(root) / (degrees + prior_degrees * lacking).sqrt()[:, None, None]
+    if not bias_correction:
+        return scale_tril
+    # Column i of the factor of the scatter has a mean of that of chi with K - i degrees times that of the true one.
+    degrees = degrees.clamp_min(n_outputs)[:, None]
+    rest = degrees - torch.arange(n_outputs).to(degrees)
+    expected = (torch.lgamma((rest + 1.0) / 2.0) - torch.lgamma(rest / 2.0)).exp() * (2.0 / degrees).sqrt()
+    return scale_tril / torch.where(lacking[:, None], 1.0, expected)[:, None, :]
 
 
 def mean_over_geometric(training: TrainingSet) -> Float[Tensor, "n d"]:

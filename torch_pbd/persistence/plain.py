@@ -14,11 +14,6 @@ from torch_pbd.registry import ESTIMATORS, MOVEMENTS, REGRESSORS, load_class
 Check = Callable[[Any, str], Any]
 
 _LAW = "stiffness_law"
-_FORMER = {  # a parameter that there was: learned is what it led to
-    "HeteroscedasticGPRegressor": "shared_length_scale",
-    "WishartProcessRegressor": "start",
-    "CholeskyCovRegressor": "bias_correction",
-}
 _INTEGERS = [f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)]
 _DTYPES = ["float64", "float32", "float16", *_INTEGERS, "bool", "object"]  # column names are arrays of objects
 
@@ -43,7 +38,8 @@ def decode_parameters(description: Any, known: Mapping[str, str] = ESTIMATORS) -
         raise ValueError(f"it holds a {name!r:.80}; known are {', '.join(known)}")
     if name == "DMPController":  # files from before there was a choice are of the printed equation
         parameters = {"adaptation": "additive", **parameters}
-    parameters = {key: value for key, value in parameters.items() if key != _FORMER.get(name)}
+    former = {"HeteroscedasticGPRegressor": "shared_length_scale", "WishartProcessRegressor": "start"}.get(name)
+    parameters = {key: value for key, value in parameters.items() if key != former}  # learned is what it led to
     estimator = load_class(name)(**_decoded(name, parameters))
     device = getattr(estimator, "device", None)
     if not isinstance(device, str | None) or (device or "").startswith("meta"):  # which holds no numbers
