@@ -177,6 +177,7 @@ def test_36_an_experiment_goes_on_with_the_controllers_that_are_left(recorded, t
         monkeypatch.setattr(robot, figure, lambda *_, **__: None)
     skill = DMPController(GMMBaseline(n_components=2), n_steps=20)
     controllers = {"stiff": skill, "soft": clone(skill).set_params(alpha=16.0)}
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell lets what it runs in the background ignore it
     with RunFolder(tmp_path, {}) as folder:
         with monkeypatch.context() as patched:
             watched(patched, signal.SIGINT, at=2)
