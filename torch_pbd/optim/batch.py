@@ -116,7 +116,7 @@ def minimize_batch(
     entries, is below ``tol``, when its next step promises less than a hundredth of it, or when no step gained anything.
     Inverse Hessians that are not given are estimated by differences of the gradient.
     """
-    objective = _guarded(objective)
+    objective = guarded(objective)
     rows = torch.arange(len(start), device=start.device)
     every = _start(objective, rows, start.detach().clone(), inverse_hessian)
     first = every.loss
@@ -137,19 +137,19 @@ def minimize_batch(
     return every.x, BatchReport(every.loss, first, n_iter, status, every.inverse)
 
 
-def _guarded(objective: ValueAndGradient) -> ValueAndGradient:
+def guarded(objective: ValueAndGradient) -> ValueAndGradient:
     """The objective, with NaN for problems at whose points it raises; they are found one by one."""
 
-    def guarded(x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+    def one_by_one(x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         try:
             return objective(x, rows)
         except FAILURES:
             if len(rows) < 2:
                 return x.new_full((len(x),), math.nan), torch.full_like(x, math.nan)
-            losses, gradients = zip(*(guarded(x[i : i + 1], rows[i : i + 1]) for i in range(len(rows))), strict=True)
+            losses, gradients = zip(*(one_by_one(x[i : i + 1], rows[i : i + 1]) for i in range(len(rows))), strict=True)
             return torch.cat(losses), torch.cat(gradients)
 
-    return guarded
+    return one_by_one
 
 
 @dataclass

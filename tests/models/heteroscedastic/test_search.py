@@ -77,3 +77,19 @@ def test_evidence_that_cannot_be_computed_is_gone_around(n_restarts, many_inputs
     expected = Search(family, 2, SearchOptions(100, 1e-5)).run(evidence)
     found = Search(family, 2, SearchOptions(100, 1e-5, n_restarts)).run(limited)
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-3)
+
+
+def test_a_process_whose_evidence_cannot_be_computed_leaves_the_others_alone(many_inputs, rng):
+    family = ProcessFamily(many_inputs, 0.3, 1.2, 0.0, exact=True)
+    evidence = evidence_of(family, many_inputs, curves(many_inputs, rng))
+
+    def failing(theta, rows):
+        if ((rows == 0) & (theta[:, -1] > -0.5)).any():
+            raise NotPositiveDefiniteError("too large")
+        return evidence(theta, rows)
+
+    searches = [Search(family, 2, SearchOptions(100, 1e-5)) for _ in range(2)]
+    (points, of_one), (_, expected) = searches[0].on_grid(failing), searches[1].on_grid(evidence)
+    assert of_one[:, 0].isneginf().tolist() == (points[:, -1] > -0.5).tolist()
+    torch.testing.assert_close(of_one[:, 1], expected[:, 1], rtol=1e-12, atol=0)
+    torch.testing.assert_close(searches[0].run(failing)[1], searches[1].run(evidence)[1], rtol=0, atol=1e-6)

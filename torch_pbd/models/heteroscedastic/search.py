@@ -16,12 +16,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torch_pbd.exceptions import NotPositiveDefiniteError
 from torch_pbd.files.memory import require_much
 from torch_pbd.gp.observations import spacing
 from torch_pbd.models.heteroscedastic.log_variance import Squares, log_variance_evidence
-from torch_pbd.models.heteroscedastic.processes import Evidence, FixedFeatures, Gradient, ProcessFamily, inducing_inputs
-from torch_pbd.optim.batch import FitReport, Progress, Status, first_failure, minimize_batch
+from torch_pbd.models.heteroscedastic.processes import Evidence, FixedFeatures, ProcessFamily, inducing_inputs
+from torch_pbd.optim.batch import FitReport, Progress, Status, first_failure, guarded, minimize_batch
 
 # Prior medians of length scale (in ranges of the input) and amplitude, and prior deviation of the constant. Means
 # are of outputs with unit variance, log variances and coefficients of residuals with a pooled unit covariance.
@@ -158,7 +157,7 @@ class Search:
             return self.held
 
         def loss(theta: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-            found, gradient = _wherever(evidence, theta, rows % self.n_processes)
+            found, gradient = evidence(theta, rows % self.n_processes)
             prior, of_prior = self.family.log_prior(theta)
             return -found - prior, -gradient() - of_prior
 
@@ -191,20 +190,13 @@ class Search:
         inducing, every = self.family.inducing, torch.arange(self.n_processes)
         points = inducing.new_tensor([[math.log(scale)] * inducing.shape[1] + [size] for scale, size in _STARTS])
         small = self.n_processes * len(inducing) ** 2 < _SMALL
+        value = guarded(lambda theta, rows: (evidence(theta, rows)[0], theta))
         parts = [
-            _wherever(evidence, part.repeat_interleave(len(every), dim=0), every.repeat(len(part)).to(points.device))[0]
+            value(part.repeat_interleave(len(every), dim=0), every.repeat(len(part)).to(points.device))[0]
             for part in points.split(len(points) if small else 2)
         ]
         values = torch.cat(parts).reshape(len(points), -1) + self.family.log_prior(points)[0][:, None]
         return points, values.nan_to_num(nan=-math.inf)
-
-
-def _wherever(evidence: Evidence, theta: Tensor, rows: Tensor) -> tuple[Tensor, Gradient]:
-    """Log evidence, NaN where it is too far to be computed."""
-    try:
-        return evidence(theta, rows)
-    except (NotPositiveDefiniteError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
-        return math.nan * theta.sum(-1), lambda: theta
 
 
 def stretched(
