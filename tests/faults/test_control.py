@@ -212,8 +212,10 @@ def test_56_a_parameter_out_of_range_is_named(option, value):
 
 def test_59_calls_that_make_no_sense_say_so():
     controller = RealTimeAdmittance(make_schedule(duration=0.01), velocity_limit=1.0)
-    with pytest.raises(RuntimeError, match=r"call start\(now\)"):
-        controller.tick(0.0, [0.0, 0.0])
+    for force in ([1.0, math.nan], [1.0]):
+        with pytest.raises(RuntimeError, match=r"call start\(now\)"):
+            controller.tick(0.0, force)
+    assert (controller.force, controller.faults) == ((0.0, 0.0), 0)
     for arguments, words in [
         ((math.nan,), "now is nan"),
         ((0.0, [0.0]), r"position has shape \(1,\), must have shape \(2,\)"),

@@ -141,11 +141,10 @@ class RealTimeAdmittance:
         options = options_of_blocks(given | {"stop_deceleration": stop_deceleration}, len(schedule.blocks))
         rate = checks.number(rate, "rate", above=0.0, unit="1/s")
         self._channel = ForceChannel(options, schedule.blocks, hold_ticks)
-        steady = stiffness_filter is not None
-        self._table = table = ScheduleTable(schedule, mass, rate, options["spring_limit"], steady=steady)
-        self._clock = ScheduleClock(table, options, soft_start, on_gap)
-        self._motion = Motion(table, self._clock, options, stiffness_filter, max_step, max_bad_ticks)
-        self._is_pose, self._turn = len(table.blocks) == 2, threading.Lock()
+        self._table = ScheduleTable(schedule, mass, rate, options["spring_limit"], steady=stiffness_filter is not None)
+        self._clock = ScheduleClock(self._table, options, soft_start, on_gap)
+        self._motion = Motion(self._table, self._clock, options, stiffness_filter, max_step, max_bad_ticks)
+        self._is_pose, self._turn = len(self._table.blocks) == 2, threading.Lock()
         self.start(0.0)
         self._motion.last = math.nan  # the robot's own start is still to come
 
@@ -224,9 +223,10 @@ class RealTimeAdmittance:
             channel, motion = self._channel, self._motion
             step = now - motion.last
             is_regular = motion.is_regular and 0.0 < step <= motion.max_step
+            if not is_regular and math.isnan(motion.last):
+                raise RuntimeError("tick before start: call start(now) with the time of the same clock first.")
             status = channel.take(force, step if is_regular else motion.step)
-            if channel.is_lost:
-                motion.is_stopped = True
+            motion.is_stopped |= channel.is_lost
             status |= motion.live(now, step, channel.push) if is_regular else motion.live_irregular(now, channel.push)
             if motion.is_stopped:
                 status |= TickStatus.STOPPED

@@ -151,8 +151,6 @@ class Motion:
 
     def _read(self, now: float) -> int:
         """Fault of a tick that differs from the last one."""
-        if math.isnan(self.last):
-            raise RuntimeError("tick before start: call start(now) with the time of the same clock first.")
         if self.is_regular:
             self.is_regular, self._newest = False, self.last
         if not self._newest < now < math.inf:
