@@ -90,13 +90,18 @@ def test_44_each_file_is_one_of_these(folder):
 
 
 def test_what_is_learned_is_what_it_was():
-    """Rounding of y, 1e-15 of it, moves these by 8e-11 at most, and so would that of another processor."""
+    """Rounding of y, 1e-15 of it, moves these by 8e-11 at most; another processor's rounding may do more to two."""
+    rtols = {
+        # Slopes of its evidence round to 1e-8 by the instructions of the processor, which moves the ends of searches,
+        # by 1e-6 of these, and may end one a step earlier or later: half or twice its tol moves these by 2e-5.
+        "HeteroscedasticGPRegressor": 1e-4,
+        # Expectation maximization ends at a gain of so little that rounding moves it by 4e-7.
+        "GMMBaseline": 1e-5,
+    }
     pinned, found = json.loads((Path(__file__).parent / "golden/fits.json").read_text()), fits()
     assert found.keys() == pinned.keys()
     for name, parts in pinned.items():
-        # Expectation maximization ends at a gain of so little that rounding moves it by 4e-7.
-        rtol = 1e-5 if name == "GMMBaseline" else 1e-8
         for part, values in parts.items():
             # Type I uncertainty is a share of one.
-            scale = 1.0 if part == "type1" else np.abs(values).max()
-            np.testing.assert_allclose(found[name][part], values, rtol=0, atol=rtol * scale, err_msg=f"{name} {part}")
+            atol = rtols.get(name, 1e-8) * (1.0 if part == "type1" else np.abs(values).max())
+            np.testing.assert_allclose(found[name][part], values, rtol=0, atol=atol, err_msg=f"{name} {part}")
