@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from torch_pbd.data import Demonstrations, demonstrations
+from torch_pbd.data.wanted import Wanted
 
 
 @pytest.fixture
@@ -57,6 +58,23 @@ def test_is_not_changed_through_the_callers_arrays_or_its_own(rng):
     for held in (demonstrations, before, pickle.loads(pickle.dumps(demonstrations))):
         with pytest.raises(ValueError, match="read-only"):
             held[0].position[0] = 1.0
+        with pytest.raises(ValueError, match="WRITEABLE"):
+            held[0].position.setflags(write=True)
+
+
+def test_read_only_arrays_of_the_caller_are_copied_and_what_is_held_already_is_not(ragged):
+    time, position = np.arange(5.0), np.ones((5, 1))
+    for array in (time, position):
+        array.setflags(write=False)
+    demonstrations = Demonstrations([time], [position])
+    for array in (time, position):
+        array.setflags(write=True)
+        array[:] = 7.0
+    assert demonstrations == Demonstrations(np.arange(5.0), np.ones((1, 5, 1)))
+    assert all(a is b for a, b in zip(ragged[1:].positions, ragged.positions[1:], strict=True))
+    wanted = Wanted(rate=1.0)
+    read = wanted.read_each(wanted.choose({"x": ["x"]}), [{"x": np.arange(3.0)}])["positions"]
+    assert Demonstrations([[0.0, 1.0, 2.0]], read).positions[0] is read[0]
 
 
 @pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, lambda d: pickle.loads(pickle.dumps(d))])

@@ -96,12 +96,15 @@ def preview(values: Sequence[object], limit: int = 12) -> str:
 
 
 def frozen(array: NDArray[Any]) -> Floats:
-    """Read-only float64 array: a copy, but for a whole array that is read-only already."""
-    # A view may change, and would keep alive what it is a part of.
-    is_own = array.base is None and not array.flags.writeable
-    copy = np.array(array, dtype=np.float64, order="C", copy=None if is_own else True)
-    copy.setflags(write=False)
-    return copy
+    """Read-only float64 array: a copy, but for one that is :func:`locked`."""
+    own = isinstance(array.base, memoryview) and array.base.readonly
+    copy = np.array(array, dtype=np.float64, order="C", copy=None if own else True)
+    return copy if copy is array else locked(copy)
+
+
+def locked(array: Floats) -> Floats:
+    """Read-only view that nobody can make writeable again, as an array with memory of its own could be."""
+    return np.asarray(array.data.toreadonly())
 
 
 def _as_list(values: Any, name: str) -> list[Any]:

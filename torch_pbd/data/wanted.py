@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.data.recordings import Missing, as_texts, preview
+from torch_pbd.data.recordings import Missing, as_texts, locked, preview
 from torch_pbd.data.units import TIMES
 from torch_pbd.files.memory import require_memory
 
@@ -144,8 +144,7 @@ class Wanted:
             for name, values in zip(chosen.names, columns, strict=True):
                 if values.dtype.kind not in "biuf":
                     raise ValueError(f"column {name!r} holds {values.dtype}, no numbers: leave it out by outputs=.")
-            positions.append(np.stack(columns, axis=1, dtype=np.float64))
-            positions[-1].setflags(write=False)  # which need not be copied
+            positions.append(locked(np.stack(columns, axis=1, dtype=np.float64)))  # which need not be copied
             times.append(_column(signals, chosen.time) if chosen.time else np.arange(len(columns[0])))
         given = {name: getattr(self, name) for name in ("units", "frame", "rotation", "angles", "time_unit")}
         known = {name: value for name, value in (*labels.items(), *given.items()) if value is not None}
