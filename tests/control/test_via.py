@@ -11,6 +11,7 @@ from torch_pbd import (
     TrajectoryRegressor,
     load_demonstrations,
 )
+from torch_pbd.data import make_tunnel_demonstrations
 
 TIME = np.linspace(0.0, 2.0, 101)
 
@@ -80,6 +81,22 @@ def test_an_unlikely_point_is_told_and_met(controller):
     with pytest.warns(UserWarning, match=r"via\[0\], at 1 s, is .* standard deviations .* hold 95%"):
         bent = controller.schedule(rate=100.0, via=[(1.0, [0.2, 0.6])])
     np.testing.assert_allclose(bent.position[100], [0.2, 0.6], atol=1e-3)
+
+
+@pytest.mark.filterwarnings("ignore:via")
+def test_an_unlikely_point_of_one_output_moves_the_others_no_more_than_is_likely():
+    shown = make_tunnel_demonstrations(rate=25.0)
+    controller = DMPController(TrajectoryRegressor()).fit(shown)
+    plain, deviation = controller.schedule(rate=25.0), shown.to_array().std(axis=0)[:, 0]
+    for at, given in ((0.0, plain.position[0, 0]), (5.0, plain.position[125, 0]), (5.0, np.nan), (10.0, np.nan)):
+        # Beyond the 2 um by which y varies by ten thousand times as much.
+        bent = controller.schedule(rate=25.0, via=[(at, [given, plain.position[round(25.0 * at), 1] + 0.02])])
+        change = bent.position - plain.position
+        assert change[round(25.0 * at), 1] == pytest.approx(0.02, rel=1e-6)
+        assert (np.abs(change[:, 0]) < 2.6 * deviation.max()).all()
+        assert np.abs(change[:, 1]).max() < 0.02001
+    near_end = controller.schedule(rate=25.0, via=[(9.6, plain.position[240] + [0.3, 0.0])])
+    assert np.abs(near_end.position - plain.position)[:, 0].max() < 0.32
 
 
 def test_a_movement_that_was_pushed_goes_on_from_where_it_is(controller):

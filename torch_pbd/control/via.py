@@ -2,7 +2,7 @@
 
 A conditioned model of whole movements predicts how the rest of a movement changes. That change, over movement time, is
 added to the reproduced path; gains come from the conditioned covariance. Goals that the demonstrations make unlikely
-are left to the movement primitive, which reaches any goal.
+are left to the movement primitive, which reaches any goal; what is unlikely of via points, to minimum jerk.
 """
 
 import copy
@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import BPoly, CubicSpline
 from scipy.stats import f
 
 from torch_pbd import checks
@@ -63,7 +63,9 @@ def planned(
 ) -> tuple[Any, Floats | None, Floats | None]:
     """Controller conditioned on a goal, a start and via points, and the goal and start left to its primitive.
 
-    A point that deviates by more than 95 % of demonstrations raises a warning and is passed all the same.
+    A point that deviates by more than 95 % of demonstrations raises a warning and is passed all the same. What is
+    beyond these changes the given outputs alone, by minimum jerk: a correlation that is hardly known, times thousands
+    of standard deviations, would move the others by metres.
     """
     if via is None and (not can_bend(controller) or (goal is None and start is None)):
         return controller, goal, start
@@ -78,28 +80,28 @@ def planned(
         if not change.any():
             pins.append(at)
             continue
-        distance, limit = _distance(controller, at, change)
-        share = min(1.0, limit / distance)
+        share = _likely_share(controller, at, change)
         rest[name] = None if share == 1.0 else own + (1.0 - share) * change
         known.append((at, share * change))
     even = np.linspace(0.0, controller.duration_, 2 * controller.n_steps)
     path = (
         CubicSpline(even, controller.reproduction_.plan(even, rest["goal"], rest["start"], 1.0)[0]) if points else None
     )
+    zero = np.zeros(controller.n_outputs_)
+    beyond = {0.0: zero, controller.duration_: zero}  # by movement time
     for number, (at, position) in enumerate(points):
         change = position - path(at)
-        distance, limit = _distance(controller, at, change)
-        if distance > limit:
-            checks.warn(
-                f"via[{number}], at {at:g} s, is {distance:.3g} standard deviations from the movement, where "
-                f"{limit:.3g} hold {_LIKELY:.0%} of demonstrations: how people would pass there was not shown."
-            )
-        known.append((at, change))
+        share = _likely_share(controller, at, change, f"via[{number}]")
+        known.append((at, share * change))
+        beyond[at] = (1.0 - share) * np.nan_to_num(change)
     times, changes = np.array([at for at, _ in known]), [change for _, change in known]
     # A controller that was conditioned may know its start or its end already.
     phase, before = controller.reproduction_.phase, controller.covariance_._known.time
     pins = [at for at in pins if at not in times and not np.isclose(phase(np.array([at]))[0, 0], before).any()]
     bent = conditioned(controller, times, np.reshape(changes, (-1, controller.n_outputs_)), pins=pins)
+    jerk = BPoly.from_derivatives(sorted(beyond), [(beyond[at], zero, zero) for at in sorted(beyond)])
+    likely = bent.reproduction_.bend
+    bent.reproduction_.bend = CubicSpline(likely.x, likely(likely.x) + jerk(likely.x))
     return bent, rest["goal"], rest["start"]
 
 
@@ -122,12 +124,17 @@ def _checked_points(via: Any, controller: Any) -> list[tuple[float, Floats]]:
     return points
 
 
-def _distance(controller: Any, at: float, change: Floats) -> tuple[float, float]:
-    """Mahalanobis distance of a change of the given outputs, and that within which 95 % of demonstrations lie."""
+def _likely_share(controller: Any, at: float, change: Floats, name: str = "") -> float:
+    """Share of a change of the given outputs within which 95 % of demonstrations lie; less warns, if it has a name."""
     given = ~np.isnan(change)
     inputs, size = controller.reproduction_.phase(np.array([at])), int(given.sum())
     covariance = controller.outputs_.covariance(controller.covariance_.predict_cov(inputs))[0][np.ix_(given, given)]
     degrees = min(float(controller.covariance_.predict_df(inputs)[0]), 1e12)  # infinite ones are not for f
-    square = float(change[given] @ np.linalg.solve(covariance, change[given]))
-    limit = float(size * f.ppf(_LIKELY, size, degrees) * (degrees - 2.0) / degrees)
-    return square**0.5, limit**0.5
+    distance = float(change[given] @ np.linalg.solve(covariance, change[given])) ** 0.5  # Mahalanobis distance
+    limit = float(size * f.ppf(_LIKELY, size, degrees) * (degrees - 2.0) / degrees) ** 0.5
+    if name and distance > limit:
+        checks.warn(
+            f"{name}, at {at:g} s, is {distance:.3g} standard deviations from the movement, where "
+            f"{limit:.3g} hold {_LIKELY:.0%} of demonstrations: how people would pass there was not shown."
+        )
+    return limit / max(distance, limit)
