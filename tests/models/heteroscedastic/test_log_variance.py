@@ -9,7 +9,7 @@ from torch.distributions import MultivariateNormal, kl_divergence
 
 from torch_pbd.models.heteroscedastic import log_variance
 from torch_pbd.models.heteroscedastic.log_variance import Squares
-from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation
+from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation, bands
 
 INDEPENDENT = None
 
@@ -82,11 +82,13 @@ class Evidence(torch.autograd.Function):
         return upstream[:, None, None] * ctx.saved_tensors[0], None
 
 
-@pytest.mark.parametrize("correlated", [False, True])
+@pytest.mark.parametrize("correlated", [None, "along a line", "with all"])
 def test_gradient_of_the_evidence(correlated, family, inputs, rng):
     """The mean is at its maximum: its derivative does not enter (the envelope)."""
     copies = torch.tensor(rng.uniform(1.0, 3.0, size=(2, 9)))
     whitener = torch.tensor(np.tril(rng.normal(size=(2, 9, 9)), -1) + np.eye(9))
+    whitener = bands(whitener.triu(-1)) if correlated == "along a line" else whitener
+    assert whitener.shape[-1] == (2 if correlated == "along a line" else 9)
     squares = squares_at(9, rng, noise=NoiseCorrelation(whitener, copies) if correlated else INDEPENDENT)
     theta = torch.tensor([[-1.0, 0.3], [-0.4, -0.6]], dtype=torch.float64)
     features = family.prepared(theta)(inputs).requires_grad_()
@@ -217,7 +219,7 @@ def test_correlated_squares_are_a_gaussian_process_regression_of_their_logarithm
 @pytest.mark.parametrize("degrees", [1.0, 2.5, 9.0])
 def test_correlated_squares_have_no_bias(degrees, rng):
     """A logarithm of a chi-squared number over its degrees is below zero in the mean."""
-    noise = NoiseCorrelation(torch.eye(4).double()[None], torch.ones(1, 4).double())
+    noise = NoiseCorrelation(torch.ones(20_000, 4, 1).double(), torch.ones(20_000, 4).double())
     squares = squares_at(4, rng, degrees, 20_000, noise)
     truth = np.sin(np.linspace(0.0, 4.0, 4))
     weights, _ = fit_log_variance(squares, 1e3 * torch.eye(4, dtype=torch.float64).expand(20_000, 4, 4))

@@ -5,7 +5,7 @@ from scipy.linalg import block_diag
 
 from torch_pbd.kernels import correlation
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily
-from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation
+from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation, bands
 from torch_pbd.models.heteroscedastic.search import Search, SearchOptions
 from torch_pbd.models.heteroscedastic.steps import fit_mean
 from torch_pbd.models.training import TrainingSet
@@ -28,7 +28,7 @@ def prior_gram(family, theta, x, other):
     return block_diag(*(float(a) ** 2 * block for a, block in zip(amplitude, blocks, strict=True)))
 
 
-@pytest.mark.parametrize("whitened", [False, True])
+@pytest.mark.parametrize("whitened", [None, "by bands", "by matrices"])
 @pytest.mark.parametrize("d", [1, 3])
 def test_the_mean_is_a_dense_regression_of_all_outputs_under_their_noise(d, whitened, inputs, rng):
     """Kernel matrix over outputs and inputs, noise of blocks that differ between inputs: generalized least squares."""
@@ -37,7 +37,8 @@ def test_the_mean_is_a_dense_regression_of_all_outputs_under_their_noise(d, whit
     tril = np.tril(rng.normal(size=(n, d, d)), -1) + np.eye(d) * rng.uniform(0.2, 1.5, size=(n, 1, d))
     counts = rng.integers(1, 6, size=n)
     along = np.exp(-np.abs((inputs - inputs.T).numpy()) / 0.2) if whitened else np.eye(n)
-    whitener = torch.tensor(np.linalg.inv(np.linalg.cholesky(along))).expand(d, n, n) if whitened else None
+    whitener = torch.tensor(np.linalg.inv(np.linalg.cholesky(along))).expand(d, n, n)
+    whitener = bands(whitener) if whitened == "by bands" else whitener
     roots = block_diag(*(tril / np.sqrt(counts)[:, np.newaxis, np.newaxis]))
     noise = roots @ np.kron(along, np.eye(d)) @ roots.T
     means = np.sin(3.0 * inputs.numpy() + np.arange(d)) + 0.3 * rng.normal(size=(n, d))

@@ -5,15 +5,17 @@ from scipy.linalg import block_diag
 from scipy.stats import multivariate_normal
 
 from torch_pbd.models.heteroscedastic.regression import Regression
+from torch_pbd.models.heteroscedastic.residuals import bands
 
 # A ridge of 1e-8 beside the standardized outputs' scatter keeps it regular, and moves results by as much.
 RTOL = 1e-6
+INDEPENDENT = torch.ones(3, 1).double()
 
 
 class Rows:
     """Residuals of i + 1 outputs at n inputs, and the factor of the covariance of all but the last."""
 
-    def __init__(self, rng, n=3, i=2, k=8, whitener=None, precision=(1.0, 1.0, 1.0)):
+    def __init__(self, rng, n=3, i=2, k=8, whitener=INDEPENDENT, precision=(1.0, 1.0, 1.0)):
         factor = np.tril(rng.normal(size=(n, i + 1, i + 1)), -1) + np.eye(i + 1) * rng.uniform(0.5, 2.0, (n, 1, i + 1))
         normal = rng.normal(size=(n, k, i + 1))
         self.residual = normal @ factor.transpose(0, 2, 1)
@@ -52,8 +54,10 @@ def correlations(whitened, n=3):
 
 
 def whitener_of(whitened):
-    """Inverse factor of the correlation; None for independent inputs."""
-    return torch.tensor(np.linalg.inv(np.linalg.cholesky(correlations(whitened)))) if whitened else None
+    """Inverse factor of the correlation; of independent inputs its diagonal."""
+    if whitened is None:
+        return INDEPENDENT
+    return bands(torch.tensor(np.linalg.inv(np.linalg.cholesky(correlations(whitened)))))
 
 
 @pytest.mark.parametrize("whitened", [None, "markov", "smooth"])

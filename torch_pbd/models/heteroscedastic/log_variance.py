@@ -13,7 +13,7 @@ from torch import Tensor
 from torch_pbd.linalg import safe_cholesky
 from torch_pbd.models.heteroscedastic.processes import Evidence, FixedFeatures, Gradient
 from torch_pbd.models.heteroscedastic.regression import LinearEvidence, log_det, weights_factor
-from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation
+from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation, whiten, whiten_vjp
 from torch_pbd.models.training import TrainingSet
 
 LEAST_SQUARE = 1e-6
@@ -140,13 +140,13 @@ def _fit_correlated(squares: Squares, noise: NoiseCorrelation, features: Tensor)
     half = 0.5 * squares.degrees / noise.copies
     unbiased = squares.log_mean - torch.digamma(half) + half.log()
     weight = (noise.copies / torch.polygamma(1, half)).sqrt()  # the whitener takes the copies out again
-    design = noise.whitener @ (weight.unsqueeze(-1) * features)
-    response = (noise.whitener @ (weight * unbiased).unsqueeze(-1)).squeeze(-1)
+    design = whiten(noise.whitener, weight.unsqueeze(-1) * features)
+    response = whiten(noise.whitener, (weight * unbiased).unsqueeze(-1)).squeeze(-1)
     linear = LinearEvidence.fit(design, response)
     location = (features @ linear.mean.unsqueeze(-1)).squeeze(-1)
 
     def gradient() -> Tensor:
-        return weight.unsqueeze(-1) * (noise.whitener.mT @ linear.gradient(design, response))
+        return weight.unsqueeze(-1) * whiten_vjp(noise.whitener, linear.gradient(design, response))
 
     return LogVariance(replace(linear, value=linear.value + weight.log().sum(-1)), location, gradient)
 

@@ -9,13 +9,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torch_pbd.linalg import safe_cholesky, symmetrize, triangular_inverse
+from torch_pbd.models.heteroscedastic.residuals import neighbours, whiten, whiten_vjp
 
 # Of a weight; that of its prior is one, of which a sum with a larger one keeps fewer than seven digits.
 _LARGEST_PRECISION = 1e9
 
 # Beside the scatter of standardized samples, which is one in every direction: keeps K <= d demonstrations regular.
 _RIDGE = 1e-8
-_NO_NEIGHBOUR = 1e-9  # share of an inverse correlation's diagonal that is rounding between inputs that do not adjoin
 
 
 class Weights(NamedTuple):
@@ -61,6 +61,36 @@ class LinearEvidence:
         """Posterior of the weights."""
         return Weights(self.mean, triangular_inverse(self.factor, upper=True))
 
+    @classmethod
+    def fit_blocks(
+        cls,
+        own: Float[Tensor, "n i i"],
+        beside: Float[Tensor, "m i i"],
+        features: Float[Tensor, "b i n p"],
+        response: Float[Tensor, "n i"],
+    ) -> "LinearEvidence | None":
+        """Evidence, but for y'y, of b sets of i processes; None where floating point cannot hold their precision.
+
+        The block of processes j and k in D'D is the sum over inputs l and l' of ``F_jl' c F_kl'``, with c from ``own``
+        where they are the same, from ``beside``, m of n - 1, where l' is the next, and zero else. The ``response`` is
+        D'y but for the features. By way of D, of i rows an input, this would be i times the work.
+        """
+        n_sets, size, n, n_features = features.shape
+        by_input, m, halves = features.transpose(1, 2), len(beside), []
+        for j in range(size):
+            right = 0.5 * own[:, j, :, None] * by_input
+            right[:, :m] += beside[:, j, :, None] * by_input[:, n - m :]
+            halves.append(features[:, j].mT @ right.flatten(2))
+        half = torch.stack(halves, dim=1).reshape(n_sets, size * n_features, -1)
+        precision = half + half.mT + torch.eye(size * n_features).to(half)
+        if float(precision.detach().diagonal(dim1=-2, dim2=-1).amax()) >= _LARGEST_PRECISION:
+            return None
+        factor = safe_cholesky(precision, name="the precision of the latent weights")
+        of_features = (response.mT.unsqueeze(1) @ features).flatten(1).unsqueeze(-1)
+        projected = torch.linalg.solve_triangular(factor, of_features, upper=False)
+        mean = torch.linalg.solve_triangular(factor.mT, projected, upper=True).squeeze(-1)
+        return cls(0.5 * projected.square().sum((-2, -1)) - log_det(factor), mean, factor.mT)
+
     def gradient(self, design: Float[Tensor, "*b n p"], response: Float[Tensor, "*b n"]) -> Float[Tensor, "*b n p"]:
         """Gradient of the value in the design: (y - D m) m' - D inv(P)."""
         residual = response.unsqueeze(-1) - design @ self.mean.unsqueeze(-1)
@@ -105,8 +135,8 @@ class Regression:
     """Scatter of the i standardized outputs and, last, the output: j = i + 1."""
     precision: Float[Tensor, " n"]
     """Expected inverse of the output's conditional variance."""
-    whitener: Float[Tensor, "n n"] | None
-    """W, that makes the rows at different inputs independent; None where they are."""
+    whitener: Float[Tensor, "n m"]
+    """W, that makes the rows at different inputs independent."""
 
     @classmethod
     def standardize(
@@ -114,7 +144,7 @@ class Regression:
         scatter: Float[Tensor, "n j j"],
         tril: Float[Tensor, "n i i"],
         precision: Float[Tensor, " n"],
-        whitener: Float[Tensor, "n n"] | None,
+        whitener: Float[Tensor, "n m"],
     ) -> "Regression":
         """Regression of the last output of a scatter; ``tril`` is the factor of the others' covariance."""
         size = tril.shape[-1]
@@ -146,44 +176,31 @@ class Regression:
         return torch.linalg.solve_triangular(self.root, cross, upper=False).squeeze(-1)
 
     @cached_property
-    def inverse(self) -> Float[Tensor, "n n"] | None:
-        """Inverse W'W of the correlation of the rows at different inputs; None where they are independent."""
-        return None if self.whitener is None else self.whitener.mT @ self.whitener
-
-    @cached_property
     def cross(self) -> Float[Tensor, "n i"]:
         """Product of the root's rows at each input with the responses at all, weighted by W'W."""
-        response = self.response if self.inverse is None else self.inverse @ self.response
-        return (self.root @ response.unsqueeze(-1)).squeeze(-1)
+        weighted = whiten_vjp(self.whitener, whiten(self.whitener, self.response))
+        return (self.root @ weighted.unsqueeze(-1)).squeeze(-1)
 
     @cached_property
     def couplings(self) -> tuple[Float[Tensor, "n i i"], Float[Tensor, "m i i"]] | None:
         """Products of the root's rows at one input and, m of n - 1, at one and the next, weighted by W'W.
 
-        None where inputs are coupled with others too. The inverse of an exponential correlation along a line is zero
-        but for neighbours, as that of a Markov process; where inputs are independent m is zero.
+        None where inputs are coupled with others too.
         """
-        if self.inverse is None:
-            return self.root @ self.root.mT, self.root[:0]
-        own, beside = self.inverse.diagonal()[:, None, None], self.inverse.diagonal(1)[:, None, None]
-        if float(self.inverse.tril(-2).abs().max()) > _NO_NEIGHBOUR * float(own.min()):
+        if (weights := neighbours(self.whitener)) is None:
             return None
-        return own * (self.root @ self.root.mT), beside * (self.root[:-1] @ self.root[1:].mT)
+        (own, beside), n = weights, len(self.root)
+        after = self.root[n - len(beside) :].mT
+        return own[:, None, None] * (self.root @ self.root.mT), beside[:, None, None] * (
+            self.root[: len(after)] @ after
+        )
 
     def fit(self, features: Float[Tensor, "b n p"]) -> LinearEvidence:
-        """Posterior of the weights of b sets of features, one coefficient after another, with its log evidence.
-
-        Where inputs have to do with their neighbours at most, the precision of the weights is formed of its blocks: by
-        way of the design, which has i rows an input, it would be i times the work.
-        """
+        """Posterior of the weights of b sets of features, one coefficient after another, with its log evidence."""
         if self.couplings is not None:
-            of_weights = self._weights_precision(*self.couplings, features)
-            if float(of_weights.detach().diagonal(dim1=-2, dim2=-1).amax()) < _LARGEST_PRECISION:
-                factor = safe_cholesky(of_weights, name="the precision of the coefficients' weights")
-                cross = (self.cross.mT @ features).flatten(1).unsqueeze(-1)
-                projected = torch.linalg.solve_triangular(factor, cross, upper=False)
-                mean = torch.linalg.solve_triangular(factor.mT, projected, upper=True).squeeze(-1)
-                return LinearEvidence(0.5 * projected.square().sum((-2, -1)) - log_det(factor), mean, factor.mT)
+            of_each = features.unsqueeze(1).expand(-1, self.size, -1, -1)
+            if (linear := LinearEvidence.fit_blocks(*self.couplings, of_each, self.cross)) is not None:
+                return linear
         return LinearEvidence.fit(*self._design(features))
 
     def gradient(self, linear: LinearEvidence, features: Float[Tensor, "b n p"]) -> Float[Tensor, "b n p"]:
@@ -194,9 +211,8 @@ class Regression:
         ``weight_jk F_l F_r'``.
         """
         if self.couplings is None:
-            gradient = linear.gradient(*self._design(features))
-            gradient = gradient.reshape(len(features), -1, self.size, self.size, features.shape[-1])
-            gradient = torch.einsum("mn,bmajp->bnajp", self.whitener, gradient)
+            gradient = linear.gradient(*self._design(features)).unflatten(1, (-1, self.size)).flatten(2)
+            gradient = whiten_vjp(self.whitener, gradient).unflatten(2, (self.size, self.size, -1))
             return torch.einsum("nja,bnajp->bnp", self.root, gradient)
         own, beside = (part.flatten(1).unsqueeze(1) for part in self.couplings)
         after, n = self.couplings[1].mT.flatten(1).unsqueeze(1), len(beside)
@@ -225,15 +241,6 @@ class Regression:
         """Sum of squared residuals from the coefficients that fit best at each input by itself."""
         return (self.scatter[:, -1, -1] - self.response.square().sum(-1) / self.precision).clamp_min(0.0)
 
-    def _weights_precision(self, own: Tensor, beside: Tensor, features: Tensor) -> Float[Tensor, "b ip ip"]:
-        """Precision of the weights: all pairs of coefficients by all products of two features."""
-        n, n_features = len(beside), features.shape[-1]
-        first, last = features[:, :n], features[:, len(own) - n :]
-        half = 0.5 * own.flatten(1).mT @ _products(features, features) + beside.flatten(1).mT @ _products(first, last)
-        half = half.reshape(-1, self.size, self.size, n_features, n_features).transpose(2, 3)
-        half = half.reshape(len(features), self.size * n_features, -1)
-        return half + half.mT + torch.eye(self.size * n_features).to(features)
-
     def _spread(self, covariance: Tensor, features: Tensor) -> Float[Tensor, "n ii p"]:
         """Each block of a covariance of the weights times the features (n, p) of each input."""
         size, n_features = self.size, features.shape[-1]
@@ -243,13 +250,6 @@ class Regression:
     def _design(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Design (b, n * i, i * p) of the rows of the root at each input, whitened, and the response."""
         # Row a at an input holds root_ja F for each coefficient j: n i rows, of which the whitener mixes the inputs.
-        design, response = torch.einsum("nja,bnp->bnajp", self.root, features).flatten(-2), self.response
-        if self.whitener is not None:
-            design = torch.einsum("mn,bnaq->bmaq", self.whitener, design)
-            response = self.whitener @ response
-        return design.flatten(1, 2), response.flatten().expand(len(design), -1)
-
-
-def _products(left: Float[Tensor, "b m p"], right: Float[Tensor, "b m p"]) -> Float[Tensor, "b m pp"]:
-    """All products of a feature on the left and one on the right."""
-    return (left.unsqueeze(-1) * right.unsqueeze(-2)).flatten(2)
+        design = torch.einsum("nja,bnp->bnajp", self.root, features).flatten(2)
+        response = whiten(self.whitener, self.response).flatten().expand(len(design), -1)
+        return whiten(self.whitener, design).unflatten(2, (self.size, -1)).flatten(1, 2), response

@@ -26,7 +26,7 @@ from torch_pbd.models.heteroscedastic.log_variance import (
 from torch_pbd.models.heteroscedastic.posterior import LatentCovariance, LatentMean
 from torch_pbd.models.heteroscedastic.processes import CLEAR, FixedFeatures, Gradient, inducing_inputs
 from torch_pbd.models.heteroscedastic.regression import LinearEvidence, Regression, Weights
-from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation
+from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation, neighbours, whiten, whiten_vjp
 from torch_pbd.models.heteroscedastic.search import Families, Search, SearchOptions
 from torch_pbd.models.training import TrainingSet, pooled_tril
 
@@ -57,38 +57,46 @@ def fit_mean(
     the posterior is that of all outputs together.
     """
     means, counts = rows.means(), rows.counts
-    whitener = None if noise is None else noise.whitener
     # One output: its mean over the deviation of its noise is features times weights, and noise of unit variance. In the
     # search alone no noise is less than _NONE. Rounding of kernels, 1e-16, changes the evidence of n inputs by about n
     # 1e-16 over the variance of the noise: of 1e-12 by .02 nats, and rounding of y then led to other length scales.
     scale = (counts.sqrt()[:, None] / noise_tril.square().sum(-1).sqrt()).clamp_max(1.0 / _NONE).mT.unsqueeze(-1)
-    noise_whitener = scale if whitener is None else whitener * scale.mT
-    response = _times(noise_whitener, means.mT.unsqueeze(-1)).squeeze(-1)
-    information = noise_whitener.square().sum((-2, -1))
+    whitener = torch.ones_like(scale) if noise is None else noise.whitener
+    response = whiten(whitener, scale * means.mT.unsqueeze(-1)).squeeze(-1)
+    information = whiten(whitener.square(), scale.square()).sum((-2, -1))
     fixed = FixedFeatures(search.family, rows.inputs)
 
     def evidence(theta: Tensor, outputs: Int64[Tensor, " a"]) -> tuple[Tensor, Gradient]:
         design, vjp = fixed.design_vjp(theta, information[outputs])
-        chosen, its_response = noise_whitener[outputs], response[outputs]
-        whitened = _times(chosen, design)
+        its_whitener, its_scale, its_response = whitener[outputs], scale[outputs], response[outputs]
+        whitened = whiten(its_whitener, its_scale * design)
         linear = LinearEvidence.fit(whitened, its_response)
-        transposed = chosen if whitener is None else chosen.mT
-        return linear.value, lambda: vjp(_times(transposed, linear.gradient(whitened, its_response)))
+        return linear.value, lambda: vjp(its_scale * whiten_vjp(its_whitener, linear.gradient(whitened, its_response)))
 
     processes = search.family.prepared(search.run(evidence))
     # All outputs: sqrt(count) inv(T) mean, with T the factor of the noise, has independent entries at an input.
     whitening = counts.sqrt()[:, None, None] * triangular_inverse(noise_tril)
-    design = torch.einsum("nij,jnp->nijp", whitening, processes(rows.inputs)).flatten(2)
-    response = (whitening @ means.unsqueeze(-1)).squeeze(-1)
-    if whitener is not None:
-        design = torch.einsum("imn,niq->miq", whitener, design)
-        response = torch.einsum("imn,ni->mi", whitener, response)
-    return LatentMean(processes, LinearEvidence.fit(design.flatten(0, 1), response.flatten()).weights)
+    return LatentMean(processes, _fit_outputs(processes(rows.inputs), whitening, means, whitener).weights)
 
 
-def _times(whitener: Tensor, values: Tensor) -> Tensor:
-    """Whitened values: by a matrix, or by its diagonal (..., n, 1) where it has no more."""
-    return whitener * values if whitener.shape[-1] == 1 else whitener @ values
+def _fit_outputs(
+    features: Float[Tensor, "d n p"],
+    whitening: Float[Tensor, "n d d"],
+    means: Float[Tensor, "n d"],
+    whitener: Float[Tensor, "d n m"],
+) -> LinearEvidence:
+    """Posterior of the weights of all outputs together."""
+    response = whiten(whitener, (whitening @ means.unsqueeze(-1)).transpose(0, 1))
+    if (weights := neighbours(whitener)) is not None:
+        own, beside = (part.mT.unsqueeze(-1) * whitening[len(whitening) - part.shape[1] :] for part in weights)
+        first = whitening[: len(beside)]
+        weighted = whiten_vjp(whitener, response).transpose(0, 1)
+        cross = (whitening.mT @ weighted).squeeze(-1)
+        linear = LinearEvidence.fit_blocks(whitening.mT @ own, first.mT @ beside, features.unsqueeze(0), cross)
+        if linear is not None:
+            return LinearEvidence(linear.value[0], linear.mean[0], linear.factor[0])
+    design = torch.einsum("nij,jnp->injp", whitening, features).flatten(2)
+    return LinearEvidence.fit(whiten(whitener, design).flatten(0, 1), response.flatten())
 
 
 def mean_start(
@@ -206,11 +214,11 @@ def _regress(
     residual.
     """
     deviation, noise = torch.exp(0.5 * location), whole.noise
+    whitener = torch.ones_like(deviation).unsqueeze(-1) if noise is None else noise.whitener
     tril, regressions, divergence = deviation[0][:, None, None], [], 0.0
     totals, degrees = list(whole.total), list(whole.degrees)
     for i in range(1, len(location)):
-        whitener = None if noise is None else noise.whitener[i]
-        regression = Regression.standardize(scatter[:, : i + 1, : i + 1], tril, precision[i], whitener)
+        regression = Regression.standardize(scatter[:, : i + 1, : i + 1], tril, precision[i], whitener[i])
         features, mean, covariance, own_divergence = fit_row(i, regression)
         regressions.append(regression)
         divergence += float(own_divergence)
