@@ -28,6 +28,9 @@ def test_the_table_has_what_the_run_shows():
     assert row["ratio"] == pytest.approx(row["early [mm]"] / row["late [mm]"])
     assert row["K x early"] == pytest.approx(run.schedule.stiffness[400, 0, 0])
     assert row["path error [mm]"] < 0.5
+    coarse = push(run.controller, rate=33.05)  # whose rows are not in the middle of pushes
+    largest = 166 + int(coarse.pushes["force"][0].force[166:, 0].argmax())
+    assert push_row("mine", coarse)["K x late"] == coarse.schedule.stiffness[largest, 0, 0]
 
 
 @pytest.mark.parametrize("d", [1, 3])

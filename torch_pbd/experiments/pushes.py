@@ -87,8 +87,9 @@ def _wrench(schedule: Schedule, largest: float, kind: style.Kind, axis: int) -> 
 
 
 def _middles(schedule: Schedule) -> list[int]:
-    """Rows in the middle of pushes."""
-    return [round(centre * (len(schedule) - 1)) for centre in _PUSHES]
+    """Rows nearest to the middle of pushes."""
+    time = schedule.time - schedule.time[0]
+    return [int(np.abs(time - centre * schedule.duration).argmin()) for centre in _PUSHES]
 
 
 def _pulse(phase: Floats, centre: float) -> Floats:
@@ -117,14 +118,12 @@ def damping_ratio(schedule: Schedule, damping: Floats) -> float:
 def push_row(name: str, run: Run) -> dict[str, Any]:
     """Row of the table: displacement by the two pushes, against the run without them, and stiffness there."""
     kind = style.kind_of(run.schedule.units, run.schedule.blocks[0])
-    time, stiffness = run.schedule.time, run.schedule.stiffness
-    early, late = (int(np.searchsorted(time, centre * run.controller.duration_)) for centre in _PUSHES)
+    early, late = run.schedule.stiffness[_middles(run.schedule)]
     # Against the run without pushes: how far the robot lags behind by itself does not count.
     first, second, ratio = _largest(kind.scale * (run.pushes["force"][0].position - run.unpushed.position)[:, 0])
     row = {"controller": name, f"early [{kind.unit}]": first, f"late [{kind.unit}]": second, "ratio": ratio}
     for output, label in list(enumerate(style.schedule_names(run.schedule)))[:2]:
-        row |= {f"K {label} early": float(stiffness[early, output, output])}
-        row |= {f"K {label} late": float(stiffness[late, output, output])}
+        row |= {f"K {label} early": float(early[output, output]), f"K {label} late": float(late[output, output])}
     error = run.controller.outputs_.si * run.controller.reproduction_error_
     return row | {f"path error [{kind.unit}]": kind.scale * error}
 
