@@ -13,7 +13,7 @@ from torch_pbd.control import RotationLimits, Schedule, StiffnessLaw
 from torch_pbd.data import make_pose_demonstrations, pose_covariance, pose_mean
 from torch_pbd.exceptions import ConfigError
 from torch_pbd.experiments.pushes import damping_ratio, push, push_rows, with_panda
-from torch_pbd.experiments.robot import empirical_covariances, run_robot
+from torch_pbd.experiments.robot import pose_covariances, run_robot
 from torch_pbd.experiments.run_folder import RunFolder
 from torch_pbd.plotting.style import POSITION, ROTATION
 
@@ -103,7 +103,7 @@ def test_a_schedule_gets_the_inertia_of_the_arm_and_its_damping(planned):
 
 def test_empirical_covariances_are_those_of_the_law():
     many = make_pose_demonstrations(300, duration=1.0, rate=20.0, timing=0.0, random_state=0)
-    phase, covariance = empirical_covariances(many)
+    phase, covariance = pose_covariances(many)
     roots = np.linalg.inv(np.linalg.cholesky(pose_covariance(phase)))
     white = roots @ covariance @ roots.swapaxes(1, 2)
     # Variances are within 4 sqrt(2 / 300), but for what is interpolated linearly between samples.

@@ -192,7 +192,7 @@ def pose_variability_figure(run: Run, demonstrations: Demonstrations, name: str)
     figure, (space,), bands = style.panels(4, 3, style.quiet_figure)
     plotting.plot_demonstrations(demonstrations, [0, 1, 2], space)
     poses.draw_pose_schedule(run.schedule, space, bands)
-    phase, covariances = empirical_covariances(demonstrations)
+    phase, covariances = pose_covariances(demonstrations)
     for kind, band in zip(KINDS, bands, strict=False):
         deviation = kind.scale * np.sqrt(np.linalg.eigvalsh(covariances[:, kind.outputs, kind.outputs]).clip(0.0))
         parts.plot_outputs(
@@ -203,8 +203,8 @@ def pose_variability_figure(run: Run, demonstrations: Demonstrations, name: str)
     return figure
 
 
-def empirical_covariances(demonstrations: Demonstrations) -> tuple[Floats, Floats]:
-    """Phases (n,) and covariances (n, 6, 6) of recorded poses there, at their mean, in world axes."""
+def pose_covariances(demonstrations: Demonstrations) -> tuple[Floats, Floats]:
+    """Phases (n,) and empirical covariances (n, 6, 6) of recorded poses there, at their mean, in world axes."""
     aligned = demonstrations.align(n=_N_STEPS)
     places, turns = map(np.array, aligned.to_poses())
     means = np.stack([rotations.mean(turns[:, i]) for i in range(_N_STEPS)])
