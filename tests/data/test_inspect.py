@@ -135,6 +135,9 @@ def test_several_files_may_be_named_as_the_shell_gives_them(tmp_path, capsys):
         save_demonstrations(recorded()[[k]], tmp_path / f"a_{k}.csv")
     files = [str(tmp_path / f"a_{k}.csv") for k in range(2)]
     assert main(["inspect", *files, "--loader.units", "m", "--output", str(tmp_path / "out")]) == 0
-    assert "a_0.csv to a_1.csv, 2 files: Demonstrations(n_demos=2" in capsys.readouterr().out
+    assert (
+        "a_0.csv to a_1.csv, 2 files: 2 demonstrations of 151 samples, 2 outputs (x, y), aligned\n"
+        in capsys.readouterr().out
+    )
     assert main(["inspect", "--output", str(tmp_path / "out")]) == 2
     assert "data is missing" in capsys.readouterr().err

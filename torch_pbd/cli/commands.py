@@ -171,10 +171,10 @@ def fit(options: Any, folder: Any) -> str:
 def inspect(options: Any, folder: Any) -> str:
     """Description of recordings, before anything is fitted."""
     from torch_pbd.data import inspect_demonstrations
-    from torch_pbd.experiments.comparison import figure_of_recordings
+    from torch_pbd.experiments.comparison import describe, figure_of_recordings
 
     demonstrations, description = _loaded(options, inspect_demonstrations)
-    say(f"{_name(options.data)}: {demonstrations}\n")
+    say(f"{describe(demonstrations, _name(options.data))}\n")
     figure = folder.write_figure(figure_of_recordings(demonstrations, _name(options.data)), "recordings")
     return f"{description}\n\nfigure:  {figure}"
 
