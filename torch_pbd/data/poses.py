@@ -19,7 +19,7 @@ QUATERNION = ("qw", "qx", "qy", "qz")
 
 # Degrees from the reference. The chart ends at 180, where y and -y are one rotation; a normal distribution in it that
 # is 15 degrees wide has two standard deviations left at 150.
-_FAR, _FURTHEST = 120.0, 150.0
+_FAR, FURTHEST = 120.0, 150.0
 _N_PHASES = 201  # phases of each recording in the mean, so that duration and sampling rate do not weigh in
 
 
@@ -130,7 +130,7 @@ def _check_reach(times: Sequence[Floats], turns: Sequence[Floats]) -> None:
     furthest = angles[k][i]
     what = f"ecording {k} is {furthest:.1f} degrees from the mean rotation at {times[k][i]:.6g}"
     remedy = "leave a wrong sample out, or, as of screws, learn deviations from the mean rotation of each time"
-    if furthest > _FURTHEST:
-        raise InvalidParameterError(f"r{what}, must be at most {_FURTHEST:.0f}: {remedy}.")
+    if furthest > FURTHEST:
+        raise InvalidParameterError(f"r{what}, must be at most {FURTHEST:.0f}: {remedy}.")
     if furthest > _FAR:
-        checks.warn(f"R{what}, and {_FURTHEST:.0f} are refused: {remedy}.")
+        checks.warn(f"R{what}, and {FURTHEST:.0f} are refused: {remedy}.")

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.colors import to_rgb
 
 from torch_pbd import checks, rotations
 from torch_pbd.checks import Floats
@@ -118,7 +119,7 @@ class _Writer:
         if not n_space:
             return
         path = np.pad(mean[:, :n_space], ((0, 0), (0, 3 - n_space)))
-        self._stream.log(entity, self._rerun.LineStrips3D([path], colors=[_rgb(color)]), static=True)
+        self._stream.log(entity, self._rerun.LineStrips3D([path], colors=[to_rgb(color)]), static=True)
         if covariance is None:
             return
         rows = np.linspace(0, len(mean) - 1, min(_N_ELLIPSOIDS, len(mean))).round().astype(int)
@@ -132,7 +133,7 @@ class _Writer:
             centers=path[rows],
             half_sizes=half,
             quaternions=np.roll(rotations.from_matrix(turned), -1, axis=1),  # x y z w, as Rerun has them
-            colors=[_rgb(color)],
+            colors=[to_rgb(color)],
         )
         self._stream.log(f"{entity}/covariance", ellipsoids, static=True)
 
@@ -151,7 +152,8 @@ class _Writer:
         index = self._rerun.TimeColumn("time", duration=time)
         for name, column in zip(names, np.transpose(values), strict=True):
             entity = self._rerun.new_entity_path([part for part in (*root.split("/"), name, label) if part])
-            self._stream.log(entity, self._rerun.SeriesLines(colors=[_rgb(color)], names=[label or name]), static=True)
+            lines = self._rerun.SeriesLines(colors=[to_rgb(color)], names=[label or name])
+            self._stream.log(entity, lines, static=True)
             columns = self._rerun.Scalars.columns(scalars=column)
             self._stream.send_columns(entity, indexes=[index], columns=columns)
 
@@ -168,7 +170,3 @@ def _space(demonstrations: Any) -> tuple[str, int]:
     n_space = n if n in (2, 3) and len(units) < 2 and not units & {"rad", "deg"} else 0
     first = (demonstrations.units or ("m",))[0]
     return "space" if first == "m" else f"space in {first}", n_space
-
-
-def _rgb(color: str) -> list[int]:
-    return [int(color[i : i + 2], 16) for i in (1, 3, 5)]

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torch_pbd import checks
 from torch_pbd.control.matrices import as_rows, as_tensor
+from torch_pbd.linalg import broadcast_shapes
 
 Gate = Literal["time", "phase", "none"]
 Adaptation = Literal["safe", "additive"]
@@ -214,7 +215,7 @@ def _broadcast(parts: dict[str, Tensor], n_ticks: int | None = None) -> torch.Si
     """Shape (..., d), or (..., n_ticks, d), to which all parts broadcast; outputs do not."""
     shapes = {name: tuple(part.shape) for name, part in parts.items()}
     with suppress(RuntimeError):
-        common = torch.broadcast_tensors(*parts.values())[0].shape  # torch.broadcast_shapes would load sympy
+        common = broadcast_shapes(*(part.shape for part in parts.values()))
         if n_ticks in (None, common[-2]) and all(shape[-1] == common[-1] for shape in shapes.values()):
             return common
     raise ValueError(f"shapes are {shapes}, must be of the same movements, ticks and outputs.")

@@ -11,6 +11,7 @@ from scipy.linalg import expm
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
+from torch_pbd.data.poses import FURTHEST
 from torch_pbd.data.units import ANGLES, LENGTHS
 from torch_pbd.rotations import Chart
 
@@ -19,7 +20,6 @@ RESOLUTION = 1e-5
 
 _ROUNDING = 1e-11  # rounding as a share of the largest position, and in rad
 _STEPS, _FLAT = 100, 1e-3  # at most; of curvature, where two axes are as good turned
-_FURTHEST = 150.0  # degrees from the reference, as for demonstrations: at 180 a chart takes the other way round
 _NEARLY_UNIT = 1e-3  # tolerance of a quaternion's norm when typed by hand
 
 
@@ -167,10 +167,10 @@ class Outputs:
             y = self._chart.log(quaternion / norm)
             angle = np.rad2deg(np.linalg.norm(y, axis=-1))
             checks.require(
-                np.isnan(angle) | (angle <= _FURTHEST),
+                np.isnan(angle) | (angle <= FURTHEST),
                 angle,
                 f"the angle of {name} to the reference of the demonstrations, in degrees,",
-                f"at most {_FURTHEST:g}",
+                f"at most {FURTHEST:g}",
                 "is the quaternion in the order w x y z?",
             )
             given = np.concatenate([given[..., :p], y], axis=-1)
