@@ -85,7 +85,7 @@ def test_an_unlikely_point_is_told_and_met(controller):
 
 @pytest.mark.filterwarnings("ignore:via")
 def test_an_unlikely_point_of_one_output_moves_the_others_no_more_than_is_likely():
-    shown = make_tunnel_demonstrations(rate=25.0)
+    shown = make_tunnel_demonstrations(rate=25.0, random_state=0)
     controller = DMPController(TrajectoryRegressor()).fit(shown)
     plain, deviation = controller.schedule(rate=25.0), shown.to_array().std(axis=0)[:, 0]
     for at, given in ((0.0, plain.position[0, 0]), (5.0, plain.position[125, 0]), (5.0, np.nan), (10.0, np.nan)):
