@@ -370,14 +370,8 @@ def test_what_is_known_twice_is_refused(model):
         model.condition([[0.5]], [[1.0, 0.5, 2.0]])
 
 
-@pytest.mark.filterwarnings("ignore:y has 6 demonstrations")
-def test_a_thousand_steps_of_fourteen_outputs_need_no_matrix_of_all():
-    rng = np.random.default_rng(0)
-    grid, n_demos, d = np.linspace(0.0, 1.0, 1000), 6, 14
-    phases = rng.normal(size=(n_demos, 1, d)) * 0.1
-    demos = np.sin(2.0 * np.pi * (grid[:, np.newaxis] + phases)) + 0.1 * rng.normal(size=(n_demos, 1, d))
-    X, y, groups = stacked(demos, grid)
-    model = TrajectoryRegressor(GMMBaseline(n_components=3, n_restarts=0)).fit(X, y, groups=groups)
+def largest_tensor(work):
+    """Number of entries of the largest tensor that ``work`` makes."""
     largest = 0
 
     class Watch(torch.overrides.TorchFunctionMode):
@@ -387,13 +381,41 @@ def test_a_thousand_steps_of_fourteen_outputs_need_no_matrix_of_all():
             largest = max(largest, result.numel() if isinstance(result, torch.Tensor) else 0)
             return result
 
-    at = grid[:, np.newaxis]
     with Watch():
+        work()
+    return largest
+
+
+@pytest.mark.filterwarnings("ignore:y has 6 demonstrations")
+def test_four_hundred_steps_of_fourteen_outputs_need_no_matrix_of_all():
+    rng = np.random.default_rng(0)
+    grid, n_demos, d = np.linspace(0.0, 1.0, 400), 6, 14
+    phases = rng.normal(size=(n_demos, 1, d)) * 0.1
+    demos = np.sin(2.0 * np.pi * (grid[:, np.newaxis] + phases)) + 0.1 * rng.normal(size=(n_demos, 1, d))
+    X, y, groups = stacked(demos, grid)
+    model = TrajectoryRegressor(GMMBaseline(n_components=3, n_restarts=0)).fit(X, y, groups=groups)
+    at = grid[:, np.newaxis]
+
+    def work():
         model.sample_demonstrations(at, 2, 0)
-        known = model.condition(at[:500:2], demos[0, :500:2])
+        known = model.condition(at[:200:2], demos[0, :200:2])
         known.predict_cov(at)
         model.score_demonstrations(at, demos[0])
-    assert largest <= 0.1 * (1000 * 14) ** 2
+
+    assert largest_tensor(work) <= 0.1 * (400 * 14) ** 2
+
+
+def test_rows_of_a_bent_movement_need_no_matrix_of_all(model):
+    bent = model.condition([[0.5]], [[1.0, 0.5]])
+    at, some = np.linspace(0.0, 1.0, 3000)[:, np.newaxis], slice(None, None, 300)
+
+    def work():
+        covariance, uncertainty = bent.predict_cov(at), bent.predict_uncertainty(at)
+        np.testing.assert_allclose(covariance[some], bent.predict_cov(at[some]), rtol=1e-9)
+        for part, alone in zip(uncertainty, bent.predict_uncertainty(at[some]), strict=True):
+            np.testing.assert_allclose(part[some], alone, rtol=1e-9, atol=1e-12)
+
+    assert largest_tensor(work) <= 0.5 * 3000**2
 
 
 def test_what_is_kept_of_a_law_is_of_this_fit_and_not_pickled():

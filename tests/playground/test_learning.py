@@ -49,7 +49,7 @@ def test_a_bent_movement_passes_its_points_and_an_adjusted_one_too(learned):
 
 @pytest.mark.parametrize("model", ["GMMBaseline", "ProMPBaseline"])
 def test_the_python_lines_give_the_schedule_again(model, tmp_path, monkeypatch, capsys):
-    learned, _ = learned_from((model,), stiffness_max=700.0, speed=0.5, mass=2.0, smooth=True)
+    learned, _ = learned_from((model,), stiffness_max=700.0, speed=1.5, mass=2.0, smooth=True)
     learning.bend(learned, [(0.7, 0.4, 0.35)])
     for name in messages.FILES:
         (tmp_path / name).write_bytes(learning.take_home(learned, name))

@@ -117,14 +117,14 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         the fit and 1 beyond them. ``type2`` is the variability given observations.
         """
         weight, parts = self._components(self._times(X))
-        mean, type1, type2 = zip(*(law._uncertainty(own) for law, own in parts), strict=True)
+        mean, type1, type2 = zip(*(by_chunks(law._uncertainty, own) for law, own in parts), strict=True)
         moments = list(zip(mean, type2, strict=True))
         return Uncertainty(weight @ np.stack(type1), mixed(weight, moments, "kia,kib->iab")[1])
 
     def _uncertainty(self, time: Floats) -> tuple[Floats, Floats, Floats]:
         """Mean, Type I uncertainty and variability of each row under one component."""
         scaled = self._rounded(time)
-        mean, covariance = by_chunks(self._rows, time)
+        mean, covariance = self._rows(time)
         return mean, ((scaled < 0.0) | (scaled > 1.0)).astype(np.float64), covariance
 
     def predict_joint(self, X: ArrayLike) -> tuple[Floats, Floats]:
