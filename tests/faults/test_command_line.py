@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -108,18 +109,21 @@ def test_47_a_link_to_a_folder_is_that_folder(data, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "arguments", [["--help"], ["demo", "--help"], ["demo", "--print_config"], ["fit"]], ids=" ".join
+    ("closed", "arguments"),
+    [
+        *product([["stdout"], ["stderr"]], [["--help"], ["demo", "--help"], ["demo", "--print_config"]]),
+        (["stdout", "stderr"], ["fit"]),
+    ],
+    ids=" ".join,
 )
-@pytest.mark.parametrize("closed", ["stdout", "stderr"])
-def test_48_nobody_who_reads_is_no_error(arguments, closed, data, tmp_path):
+def test_48_nobody_who_reads_is_no_error(closed, arguments, data, tmp_path):
     """As in ``torch-pbd ... | head -0``: no traceback, and the results are there."""
     if arguments == ["fit"]:
         arguments = ["fit", "--data", str(data), *GMM, "--output", str(tmp_path / "out")]
-        if closed == "stderr":
-            arguments += ["--resume"]  # which says that there is nothing to resume
+        arguments += ["--resume"]  # which says to standard error that there is nothing to resume
     reading, writing = os.pipe()
     os.close(reading)
-    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | {closed: writing}
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | dict.fromkeys(closed, writing)
     buffered = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}  # as it is for users
     process = subprocess.Popen([*COMMAND, *arguments], text=True, env=buffered, **streams)
     os.close(writing)

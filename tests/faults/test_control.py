@@ -287,7 +287,7 @@ def test_60_ticks_keep_no_memory(d, coupled):
     tracemalloc.start()
     ticks(500, 1000)
     before = tracemalloc.get_traced_memory()[0]
-    ticks(1000, 1000 + (2000 if coupled else 20_000))
+    ticks(1000, 1000 + (2000 if coupled else 5000))
     grown = tracemalloc.get_traced_memory()[0] - before
     tracemalloc.stop()
     assert grown < 2000

@@ -109,7 +109,7 @@ def test_noise_and_too_much_of_it_end_no_more_than_the_page(address):
             assert ask(page, noise, "error")["text"]
         assert "data" not in ask(page, {"type": "read", "name": "/etc/passwd", "content": ""}, "error")
         with pytest.raises(ConnectionClosed):
-            ask(page, {"type": "learn", "strokes": [[[0.001 * i, 0.0, 0.0] for i in range(1_000_000)]] * 2}, "picture")
+            ask(page, {"type": "learn", "strokes": [[[0.001 * i, 0.0, 0.0] for i in range(100_000)]] * 2}, "picture")
     with open_page(address) as page:
         assert not ask(page, {"type": "frame"}, "robot")["is_there"]
 
