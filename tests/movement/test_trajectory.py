@@ -63,6 +63,17 @@ def found_kernel(residual, *kernels):
     return fit_time_kernel(grid, residual, torch.ones_like(residual[0]), list(kernels), None)
 
 
+@pytest.mark.parametrize("order", [[1, 0], [0, 1]])
+def test_a_smooth_output_that_varies_with_a_rough_one_is_drawn_as_smooth_in_any_order_of_columns(order):
+    """Given the rough one first, what trembles in it came into the other by their covariance."""
+    slow = movements(8)[..., 0]
+    demos = np.stack([slow, slow + 0.1 * np.random.default_rng(0).standard_normal(slow.shape)], axis=2)
+    X, y, groups = stacked(demos[..., order])
+    drawn = TrajectoryRegressor().fit(X, y, groups=groups).sample_demonstrations(X[:30], 500, 0)
+    bends = [np.sqrt(np.square(np.diff(part, 2, axis=1)).mean((0, 1))) for part in (drawn, demos[..., order])]
+    assert (bends[0] / bends[1])[order.index(0)] < 1.5
+
+
 def whole_correlation(along):
     """Correlation (n d, n d) of all entries, of that of each output (d, n, n)."""
     d, n, _ = along.shape

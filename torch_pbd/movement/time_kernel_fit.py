@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from torch_pbd.linalg import safe_cholesky, symmetrize
@@ -25,6 +25,8 @@ _SMOOTH = 1e-3  # largest nugget of a step that is distinguished from noise: suc
 _NEAR = 2.5  # factor around a length scale within which it is searched again once there are nuggets
 _USUAL = 2.0  # factor around the median within which the size of a step's residuals is usual
 _ROUNDS = 3  # alternations of nuggets and length scale, which depend on each other
+# Of outputs whose mean square second differences are within such a factor the first given comes first.
+_ROUGHER = 4.0
 _SHARES = (1.0, 0.9, 0.75, 0.6, 0.45, 0.3, 0.2, 0.1, 0.05)  # candidate weights of the kernel in the correlation
 
 
@@ -49,7 +51,7 @@ def fit_time_kernel(
 ) -> TimeKernel:
     """Time kernel of whitened residuals, NaN where a demonstration has no sample near, over times of range one.
 
-    Each output's residuals, given the outputs before it, were divided by its ``deviation``. The likeliest of the
+    Each output's residuals, given those that are smoother, were divided by its ``deviation``. The likeliest of the
     ``kernels`` is taken, and for ``share`` None the share under which demonstrations left out in turn are likeliest.
     """
     parts, tremor = map(_unit_rms, residual.unbind(2)), deviation.median(0).values / deviation
@@ -168,6 +170,17 @@ class _Output:
             if float(change) < _TOLERANCE:
                 break
         return nugget
+
+
+def smoothest_first(residual: Float[Tensor, "K T d"]) -> Int64[Tensor, " d"]:
+    """Order in which each output is given those before it, by residuals over their deviations at each step.
+
+    What trembles in one is passed on to those after it as far as they vary together, and draws of smooth outputs given
+    a rough one would be as rough.
+    """
+    bend = residual.diff(n=2, dim=1).square().nanmean((0, 1)) / residual.square().nanmean((0, 1))
+    bend = bend.nan_to_num(nan=1.0).clamp_min(_LEAST)  # of a constant output, or fewer than three steps
+    return ((bend / bend.min()).log() / math.log(_ROUGHER)).floor().argsort(stable=True)
 
 
 def _log_likelihood(covariance: Float[Tensor, "b n n"], rows: Float[Tensor, "n s"]) -> Float[Tensor, " b"]:

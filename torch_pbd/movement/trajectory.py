@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from numpy.typing import ArrayLike
 from sklearn.base import clone
 from torch import Tensor, nn
@@ -22,7 +22,7 @@ from torch_pbd.linalg import safe_cholesky
 from torch_pbd.movement.joint import JointNormal
 from torch_pbd.movement.law import as_rows, check_arrays
 from torch_pbd.movement.time_kernel import TimeKernel
-from torch_pbd.movement.time_kernel_fit import fit_time_kernel
+from torch_pbd.movement.time_kernel_fit import fit_time_kernel, smoothest_first
 from torch_pbd.movement.timed import TimedMovement, n_grid_steps, sampled
 
 _FEWEST_DF, _MOST_DF = 3.0, 200.0  # bounds of the joint law's df: its variance must exist; above 200 it is normal
@@ -34,18 +34,22 @@ _WHOLE = 2.0
 class TrajectoryLaw(nn.Module):
     """Joint law of a movement, as a torch module: differentiable in the times.
 
-    With marginals of mean m_t and covariance ``C_t = L_t L_t'``, the correlation R_j of the time kernel of each output
-    and the whitened residuals z_k of K demonstrations, the covariance is ``Sigma = A S A'`` with
-    ``S = w blockdiag(R_1, R_2, ...) + (1 - w) / K sum_k z_k z_k'`` and ``A_t = L_t chol(S_tt)^-1``, so that its blocks
-    ``Sigma_tt`` are the marginals' C_t.
+    With marginals of mean m_t and covariance ``C_t = L_t L_t'``, L_t triangular with the outputs in ``order``, the
+    correlation R_j of the time kernel of each output and the whitened residuals z_k of K demonstrations, the covariance
+    is ``Sigma = A S A'`` with ``S = w blockdiag(R_1, R_2, ...) + (1 - w) / K sum_k z_k z_k'`` and
+    ``A_t = L_t chol(S_tt)^-1``, so that its blocks ``Sigma_tt`` are the marginals' C_t.
     """
 
     x_shift: Tensor
     x_scale: Tensor
+    order: Tensor
 
-    def __init__(self, marginals: nn.Module | None, time_kernel: TimeKernel, x_shift: float, x_scale: float) -> None:
+    def __init__(
+        self, marginals: nn.Module | None, time_kernel: TimeKernel, order: Tensor, x_shift: float, x_scale: float
+    ) -> None:
         super().__init__()
         self.marginals, self.time_kernel = marginals, time_kernel
+        self.register_buffer("order", order)
         for name, value in (("x_shift", x_shift), ("x_scale", x_scale)):
             self.register_buffer(name, torch.tensor(value, dtype=torch.float64))
         self.requires_grad_(False)
@@ -65,17 +69,24 @@ class TrajectoryLaw(nn.Module):
         loadings = ((1.0 - kernel.share) / len(kernel.residual)).sqrt() * kernel.loadings(time)
         # A_t divides by the factor of S_tt, so that the blocks of the joint law are those of the marginals.
         own = loadings @ loadings.mT + kernel.share * torch.eye(mean.shape[1]).to(mean)
-        root = safe_cholesky(covariance, name="the covariance at a step")
+        root = root_in_order(covariance, self.order)
         factor = torch.linalg.solve_triangular(torch.linalg.cholesky(own), root, upper=False, left=False)
         return JointNormal.prior(mean, factor, kernel.share * kernel.correlation(time, time), loadings)
+
+
+def root_in_order(covariance: Float[Tensor, "n d d"], order: Int64[Tensor, " d"]) -> Float[Tensor, "n d d"]:
+    """Roots of covariances in which each output is given those before it in an order, lower triangular in that."""
+    root = safe_cholesky(covariance[:, order][:, :, order], name="the covariance at a step")
+    back = order.argsort()
+    return root[:, back][:, :, back]
 
 
 @dataclass(eq=False, repr=False)
 class TrajectoryRegressor(TimedMovement):
     """Joint law of a whole demonstration: marginals of a covariance regressor and a correlation along the movement.
 
-    The marginals stay those of the regressor. Each output, given those before it, has a nugget at each step and a time
-    kernel: a slow part proportional to the standard deviation at each step, and a tremor of constant size in the
+    The marginals stay those of the regressor. Each output, given those that are smoother, has a nugget at each step and
+    a time kernel: a slow part proportional to the standard deviation at each step, and a tremor of constant size in the
     output's units. This correlation is shrunk towards that of the demonstrations themselves. Draws and scores use a
     Student's t with one chi-squared variable per movement; conditioning uses the normal formulas. Only
     :meth:`predict_joint` forms a matrix of all steps and outputs.
@@ -171,20 +182,20 @@ class TrajectoryRegressor(TimedMovement):
         mean, covariance = self._regressor_rows(grid)
         residual = np.stack([sampled(recording, grid) for recording in recordings]) - mean
         # z = inv(L_t) (y_t - m_t) has unit covariance at each step; only its correlation along time is to be found.
-        root = np.linalg.cholesky(covariance)
-        whitened = np.linalg.solve(root, residual[..., np.newaxis])[..., 0]
+        order = smoothest_first(torch.from_numpy(residual / np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))))
+        root = root_in_order(torch.from_numpy(covariance), order)
+        whitened = torch.linalg.solve(root, torch.from_numpy(residual).unsqueeze(-1)).squeeze(-1)
         kernels = ("matern52", "squared_exponential") if self.time_kernel == "auto" else (self.time_kernel,)
         share = None if self.shrinkage == "auto" else 1.0 - float(self.shrinkage)
         scaled = torch.from_numpy((grid - low) / width)
-        deviation = torch.from_numpy(root).diagonal(dim1=1, dim2=2)
-        found = fit_time_kernel(scaled, torch.from_numpy(whitened), deviation, kernels, share)
-        self._set_law(found)
+        found = fit_time_kernel(scaled, whitened, root.diagonal(dim1=1, dim2=2), kernels, share)
+        self._set_law(found, order)
         degrees = self.regressor_.predict_df(grid[:, np.newaxis])
         self.df_ = float(np.clip(np.median(degrees) / _WHOLE, _FEWEST_DF, _MOST_DF))
         self.time_kernel_ = found.kernel
 
-    def _set_law(self, kernel: TimeKernel) -> None:
-        self.module_ = TrajectoryLaw(getattr(self.regressor_, "module_", None), kernel, *self._range)
+    def _set_law(self, kernel: TimeKernel, order: Tensor) -> None:
+        self.module_ = TrajectoryLaw(getattr(self.regressor_, "module_", None), kernel, order, *self._range)
         self.length_scale_, self.shrinkage_ = self._range[1] * kernel.scales[:, 0].numpy(), 1.0 - float(kernel.share)
         self.nugget_scale_ = np.sqrt(kernel.nugget.numpy().T)
 
@@ -214,7 +225,9 @@ class TrajectoryRegressor(TimedMovement):
 
     def _arrays(self) -> dict[str, Floats]:
         state = self.module_.state_dict().items()
-        own = {key.rpartition(".")[2]: value.numpy() for key, value in state if not key.startswith("marginals.")}
+        own = {
+            key.rpartition(".")[2]: value.double().numpy() for key, value in state if not key.startswith("marginals.")
+        }
         return own | self._timing_arrays()
 
     def _restore(self, arrays: dict[str, Floats]) -> None:
@@ -222,16 +235,18 @@ class TrajectoryRegressor(TimedMovement):
         n_steps, d = len(np.atleast_1d(arrays["grid"])), self.n_outputs_
         shapes: dict[str, tuple[int | str, ...]] = {
             "grid": (n_steps,), "scales": (d, 2), "fine": (d, n_steps), "nugget": (d, n_steps),
-            "residual": ("K", n_steps, d), "share": (), "x_shift": (), "x_scale": (),
+            "residual": ("K", n_steps, d), "share": (), "x_shift": (), "x_scale": (), "order": (d,),
         }  # fmt: skip
         check_arrays(arrays, shapes)
         for name in ("nugget", "scales"):
             checks.require(arrays[name] > 0.0, arrays[name], name, "above 0")
         checks.require(np.diff(arrays["grid"]) > 0.0, arrays["grid"][1:], "grid", "increasing")
         checks.number(float(arrays["share"]), "share", above=0.0, most=1.0)
+        order = arrays.pop("order")
+        checks.require(np.sort(order) == np.arange(d), order, "order", f"each number from 0 to {d - 1} once")
         self._range = float(arrays.pop("x_shift")), float(arrays.pop("x_scale"))
         own = {name: torch.tensor(array) for name, array in arrays.items()}
-        self._set_law(TimeKernel(self.time_kernel_, **own))
+        self._set_law(TimeKernel(self.time_kernel_, **own), torch.tensor(order).long())
 
     def _prior(self, time: Floats) -> JointNormal:
         return self._joint(time, *self._regressor_rows(time))
