@@ -246,15 +246,24 @@ def table_of_sets(rows: list[dict[str, Any]]) -> str:
         error = difference.std(ddof=1) / math.sqrt(len(difference)) if len(difference) > 1 else math.nan
         means = " | ".join(f"{np.mean(values[name, model]):.0f}" for model in models)
         own = [row for row in rows if (row["set"], row["model"]) == (name, "TrajectoryRegressor")]
-        ratios = [np.exp(np.mean([np.log(row[f"{case}_rmse"]) for row in own])) for case in ("replanned", "moving")]
-        lines.append(
-            f"| {name} | {means} | {difference.mean():.0f} +- {error:.0f} | {ratios[0]:.2f} | {ratios[1]:.2f} |"
-        )
+        cells = [_ratio([row[f"{case}_rmse"] for row in own]) for case in ("replanned", "moving")]
+        lines.append(f"| {name} | {means} | {difference.mean():.0f} +- {error:.0f} | {' | '.join(cells)} |")
         ahead.append(difference.mean())
     if len(ahead) > 1:
         error = np.std(ahead, ddof=1) / math.sqrt(len(ahead))
         lines.append(f"| mean of the sets {'| ' * len(models)}| {np.mean(ahead):.0f} +- {error:.0f} | | |")
     return "\n".join(lines)
+
+
+def _ratio(values: list[float]) -> str:
+    """Geometric mean of ratios, and its standard error."""
+    logarithm = np.log(values)
+    mean = float(np.exp(logarithm.mean()))
+    return (
+        f"{mean:.2f} +- {mean * logarithm.std(ddof=1) / math.sqrt(len(values)):.2f}"
+        if len(values) > 1
+        else f"{mean:.2f}"
+    )
 
 
 def table_of_lengths(rows: list[dict[str, Any]]) -> str:
