@@ -84,8 +84,15 @@ def test_without_a_filter_the_papers_damping_feeds_a_heavy_robot():
     assert (stored[-1] / stored[0]).item() == pytest.approx(7000.0, rel=0.1)
 
 
-@pytest.mark.parametrize("stiffness_filter", [RateLimit(), EnergyTank()], ids=["rate limit", "tank"])
-@pytest.mark.parametrize("dt", [1.6e-2, 4e-3])
+@pytest.mark.parametrize(
+    ("stiffness_filter", "dt"),
+    [
+        (RateLimit(), 1.6e-2),
+        (EnergyTank(), 4e-3),
+        pytest.param(RateLimit(), 4e-3, marks=pytest.mark.slow),
+        pytest.param(EnergyTank(), 1.6e-2, marks=pytest.mark.slow),
+    ],
+)
 def test_with_either_filter_the_heavy_robot_comes_to_rest(stiffness_filter, dt):
     given = unstable(dt)
     unfiltered = energy(AdmittancePlant(10.0).simulate(**given), 10.0 * torch.eye(1).double())

@@ -12,8 +12,14 @@ N_DEMOS = 2000
 SHAPES = get_args(Shape)
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("via_precision", [None, 0.004])
+@pytest.mark.parametrize(
+    ("shape", "via_precision"),
+    [
+        pytest.param(shape, (None, 0.004)[(place + other) % 2], marks=[pytest.mark.slow] if other else [])
+        for other in (0, 1)
+        for place, shape in enumerate(SHAPES)
+    ],
+)
 def test_thousands_of_demonstrations_have_the_mean_and_the_covariance(shape, via_precision):
     options = {"rate": 10.0, "timing": 0.0, "via_precision": via_precision, "random_state": 0}
     made = make_handwriting_demonstrations(shape, N_DEMOS, **options)

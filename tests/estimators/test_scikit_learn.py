@@ -34,15 +34,26 @@ from estimators.zoo import (
 from torch_pbd.metrics import log_likelihood_scorer
 
 # Their data have no two inputs alike, where these two take longest; what is checked does not need an optimum.
-BRIEF = [new(name, max_iter=5) for name in ("wishart", "heteroscedastic")]
+BRIEF = [new("wishart", max_iter=5), new("heteroscedastic", max_iter=5, n_inducing=16)]
 
 
-# Its data are not demonstrations: more outputs than rows at an input, columns that repeat, one iteration.
-@pytest.mark.filterwarnings("ignore::torch_pbd.exceptions.DataRankWarning")
-@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
-@pytest.mark.filterwarnings("ignore::sklearn.exceptions.SkipTestWarning")
+def of_other_data(test):
+    """Test whose data are no demonstrations: more outputs than rows at an input, columns that repeat, one iteration."""
+    for category in ("torch_pbd.exceptions.DataRankWarning", "sklearn.exceptions.ConvergenceWarning"):
+        test = pytest.mark.filterwarnings(f"ignore::{category}")(test)
+    return pytest.mark.filterwarnings("ignore::sklearn.exceptions.SkipTestWarning")(test)
+
+
+@of_other_data
 @parametrize_with_checks([*(new(name) for name in ("cholesky", "mixture")), *BRIEF])
 def test_scikit_learn_checks(estimator, check):
+    check(estimator)
+
+
+@pytest.mark.slow
+@of_other_data
+@parametrize_with_checks([new(name) for name in ("wishart", "heteroscedastic")])
+def test_scikit_learn_checks_as_they_are(estimator, check):
     check(estimator)
 
 

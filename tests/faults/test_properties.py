@@ -35,8 +35,8 @@ from torch_pbd.exceptions import DataRankWarning, NotPositiveDefiniteError, Unim
 THOROUGH = settings.get_current_profile_name() == "thorough"
 SMALL = {} if THOROUGH else {"most_demos": 6, "most_steps": 8, "most_outputs": 4}
 
-# Demonstrations that are tried: by default, and thoroughly (10,000 in all). A fit of the heteroscedastic model takes
-# ten times as long as one of a mixture.
+# Demonstrations that are tried: by default, of eight and more half where they are the same in every run, and thoroughly
+# (10,000 in all). A fit of the heteroscedastic model takes ten times as long as one of a mixture.
 COUNTS = {
     "sound": {"cholesky": (30, 1900), "wishart": (30, 1900), "mixture": (120, 2400), "heteroscedastic": (5, 500)},
     "order": {"cholesky": (5, 200), "wishart": (5, 200), "mixture": (30, 400), "heteroscedastic": (2, 50)},
@@ -88,6 +88,8 @@ WARNINGS = {
 def trials(law, name="all", *, fresh=THOROUGH):
     """Settings of one test of the table; where ``fresh``, of other cases each time."""
     default, thorough = COUNTS[law][name]
+    if not fresh and default >= 8:
+        default //= 2
     return settings(
         max_examples=thorough if THOROUGH else default,
         deadline=None,

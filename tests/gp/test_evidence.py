@@ -103,8 +103,14 @@ def test_evidence_is_not_a_number_only_where_the_kernel_matrix_is_singular(gener
     assert found.isnan().tolist() == [True, False]
 
 
-@pytest.mark.parametrize("n", [10, 50])
-@pytest.mark.parametrize("signal", SIGNALS)
+@pytest.mark.parametrize(
+    ("signal", "n"),
+    [
+        pytest.param(signal, (50, 10)[(place + other) % 2], marks=[pytest.mark.slow] if other else [])
+        for other in (0, 1)
+        for place, signal in enumerate(SIGNALS)
+    ],
+)
 def test_search_finds_an_evidence_as_high_as_scikit_learn_with_restarts(signal, n, rng):
     x, y = noisy(signal, n, rng)
     found, loss, _ = fit_hyperparameters(once(x, y), EvidenceSearch(length_scale_bounds=LENGTH_BOUNDS))
