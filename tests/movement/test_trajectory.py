@@ -247,6 +247,16 @@ def test_the_likelier_kernel_is_that_of_the_movements(kernel):
     assert found_kernel(series, "matern52", "squared_exponential").kernel == kernel
 
 
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("kernel", ["squared_exponential", "matern52"])
+def test_a_step_of_noise_does_not_decide_on_the_kernel(kernel, seed, monkeypatch):
+    """Where movements end at one point noise is left: one nugget for all steps would have to be as large."""
+    monkeypatch.setattr(time_kernel_fit, "_RATIOS", ())  # without tremor
+    series = sample_series(kernel, 0.3, seed=seed)
+    series[:, -1:] = torch.from_numpy(np.random.default_rng(seed).standard_normal((8, 1, 2)))
+    assert found_kernel(series, "matern52", "squared_exponential").kernel == kernel
+
+
 def test_two_length_scales_are_found_where_movements_have_them():
     # Slow deviations, and a tenth of their variance that changes four times as fast.
     slow, fast = sample_series("matern52", 0.6, n_demos=24), sample_series("matern52", 0.15, n_demos=24).flip(0)

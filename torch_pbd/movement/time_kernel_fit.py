@@ -42,6 +42,15 @@ class Found(NamedTuple):
     nugget: float
 
 
+class Start(NamedTuple):
+    """Likeliest length scale of an output's usual steps, and the nugget of each step that goes with it."""
+
+    found: Found
+    nugget: Float[Tensor, " T"]
+    log_likelihood: float
+    """Of all steps."""
+
+
 def fit_time_kernel(
     grid: Float[Tensor, " T"],
     residual: Float[Tensor, "K T d"],
@@ -52,23 +61,35 @@ def fit_time_kernel(
     """Time kernel of whitened residuals, NaN where a demonstration has no sample near, over times of range one.
 
     Each output's residuals, given those that are smoother, were divided by its ``deviation``. The likeliest of the
-    ``kernels`` is taken, and for ``share`` None the share under which demonstrations left out in turn are likeliest.
+    ``kernels`` is taken, by demonstrations left out in turn where it is not plain, and for ``share`` None the share
+    under which they are likeliest.
     """
     parts, tremor = map(_unit_rms, residual.unbind(2)), deviation.median(0).values / deviation
     outputs = [_Output(grid, *part) for part in zip(parts, tremor.mT, strict=True)]
-    found = {name: [each.search(each.usual_steps(), name) for each in outputs] for name in kernels}
-    kernel = max(kernels, key=lambda name: sum(each.log_likelihood for each in found[name]))
+    starts = {name: [each.start(name) for each in outputs] for name in kernels}
+    # By the usual steps alone, and by all, each with its own nugget: where the two agree no other kernel is fitted.
+    of_usual = [sum(start.found.log_likelihood for start in starts[name]) for name in kernels]
+    of_all = [sum(start.log_likelihood for start in starts[name]) for name in kernels]
+    likeliest = {kernels[values.index(max(values))] for values in (of_usual, of_all)}
     shares = _SHARES if share is None else (share,)
+    fitted = [_fit_outputs(outputs, name, starts[name], shares) for name in sorted(likeliest)]
+    whole, (_, best) = max(((each, _left_out(each, shares)) for each in fitted), key=lambda pair: pair[1][0])
+    whole.share.fill_(best)
+    return whole
+
+
+def _fit_outputs(
+    outputs: Sequence["_Output"], kernel: str, starts: Sequence[Start], shares: Sequence[float]
+) -> TimeKernel:
+    """Time kernel of all outputs, of each with a tremor where left-out demonstrations are likelier so."""
     fitted = []
-    for output, single in zip(outputs, found[kernel], strict=True):
+    for output, start in zip(outputs, starts, strict=True):
         # A tremor that makes the residuals of one output likelier need not do so jointly with those of the others.
-        results = [output.fit(kernel, single, is_sum) for is_sum in (False, True)]
+        results = [output.fit(kernel, start, is_sum) for is_sum in (False, True)]
         fitted.append(max(results, key=lambda result: _left_out(result, shares)[0]))
     stacked = {name: torch.cat([getattr(each, name) for each in fitted]) for name in ("scales", "fine", "nugget")}
     filled = torch.cat([each.residual for each in fitted], dim=2)
-    whole = TimeKernel(kernel, grid=grid, **stacked, residual=filled, share=grid.new_ones(()))
-    whole.share.fill_(_left_out(whole, shares)[1])
-    return whole
+    return TimeKernel(kernel, grid=outputs[0].grid, **stacked, residual=filled, share=filled.new_ones(()))
 
 
 @dataclass(frozen=True)
@@ -79,11 +100,20 @@ class _Output:
     residual: Float[Tensor, "K T"]
     tremor: Float[Tensor, " T"]
 
-    def fit(self, kernel: str, single: Found, is_sum: bool) -> TimeKernel:
-        """Scales and nuggets in alternation, starting from the likeliest length scale of the usual steps."""
-        found = self._with_tremor(self.usual_steps(), kernel, single) if is_sum else single
+    def start(self, kernel: str) -> Start:
+        """Likeliest length scale of the usual steps, and the nugget of each step under it."""
+        found = self.search(self.usual_steps(), kernel)
         unit = self._candidates([found.scales], kernel)[0]
         nugget = self._step_nuggets(unit, _LEAST)
+        whole, groups = unit + torch.diag(nugget), _by_pattern(self.residual)
+        return Start(found, nugget, sum(float(_log_likelihood(whole[seen][None, :, seen], z)) for seen, z in groups))
+
+    def fit(self, kernel: str, start: Start, is_sum: bool) -> TimeKernel:
+        """Scales and nuggets in alternation."""
+        single, nugget = start.found, start.nugget
+        found = self._with_tremor(self.usual_steps(), kernel, single) if is_sum else single
+        unit = self._candidates([found.scales], kernel)[0]
+        nugget = self._step_nuggets(unit, _LEAST) if is_sum else nugget
         for _ in range(_ROUNDS):
             smooth = nugget <= _SMOOTH
             steps = smooth if 2 * smooth.sum() >= len(self.grid) else nugget <= nugget.median()
