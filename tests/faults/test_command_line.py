@@ -113,6 +113,8 @@ def test_47_a_link_to_a_folder_is_that_folder(data, tmp_path):
     [
         *product([["stdout"], ["stderr"]], [["--help"], ["demo", "--help"], ["demo", "--print_config"]]),
         (["stdout", "stderr"], ["fit"]),
+        pytest.param(["stdout"], ["fit"], marks=pytest.mark.slow),  # where what the other says is seen
+        pytest.param(["stderr"], ["fit"], marks=pytest.mark.slow),
     ],
     ids=" ".join,
 )
