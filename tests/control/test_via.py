@@ -99,6 +99,17 @@ def test_an_unlikely_point_of_one_output_moves_the_others_no_more_than_is_likely
     assert np.abs(near_end.position - plain.position)[:, 0].max() < 0.32
 
 
+def test_an_error_of_the_robot_is_no_deviation_of_people():
+    """A millimetre off where demonstrations agree to micrometres: told, and with the robot's error no matter."""
+    controller = DMPController(TrajectoryRegressor()).fit(make_tunnel_demonstrations(random_state=0).resample(60))
+    time, X = np.array([5.0]), np.linspace(0.0, 10.0, 21)[:, np.newaxis]
+    position = controller.predict(time[:, np.newaxis]) + np.array([0.0, 1e-3])
+    with pytest.warns(UserWarning, match=r"positions\[0, 1\] is \d+ standard deviations .* Give noise_scale"):
+        controller.condition(time, position)
+    bent = controller.condition(time, position, noise_scale=1e-3)  # and no warning, which would be an error
+    np.testing.assert_allclose(bent.predict(X), controller.predict(X), rtol=0, atol=1e-3)
+
+
 def test_a_movement_that_was_pushed_goes_on_from_where_it_is(controller):
     pushed = controller.predict([[1.0]])[0] + [0.02, -0.02]
     again = controller.condition([1.0], [pushed])
