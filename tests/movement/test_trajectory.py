@@ -23,7 +23,7 @@ from torch_pbd import (
 )
 from torch_pbd.kernels import correlation
 from torch_pbd.movement import time_kernel_fit
-from torch_pbd.movement.time_kernel_fit import fit_time_kernel
+from torch_pbd.movement.time_kernel_fit import fit_time_kernel, smoothest_first
 
 GRID = np.linspace(0.0, 1.0, 30)
 
@@ -63,15 +63,28 @@ def found_kernel(residual, *kernels):
     return fit_time_kernel(grid, residual, torch.ones_like(residual[0]), list(kernels), None)
 
 
+@pytest.mark.parametrize("shrinkage", ["auto", 0.5])
 @pytest.mark.parametrize("order", [[1, 0], [0, 1]])
-def test_a_smooth_output_that_varies_with_a_rough_one_is_drawn_as_smooth_in_any_order_of_columns(order):
+def test_a_smooth_output_that_varies_with_a_rough_one_is_drawn_as_smooth_in_any_order_of_columns(order, shrinkage):
     """Given the rough one first, what trembles in it came into the other by their covariance."""
     slow = movements(8)[..., 0]
     demos = np.stack([slow, slow + 0.1 * np.random.default_rng(0).standard_normal(slow.shape)], axis=2)
     X, y, groups = stacked(demos[..., order])
-    drawn = TrajectoryRegressor().fit(X, y, groups=groups).sample_demonstrations(X[:30], 500, 0)
+    model = TrajectoryRegressor(shrinkage=shrinkage).fit(X, y, groups=groups)
+    drawn = model.sample_demonstrations(X[:30], 500, 0)
     bends = [np.sqrt(np.square(np.diff(part, 2, axis=1)).mean((0, 1))) for part in (drawn, demos[..., order])]
     assert (bends[0] / bends[1])[order.index(0)] < 1.5
+    # What is told of each output is in the order of the columns.
+    nugget = np.median(model.nugget_scale_, axis=0)
+    assert nugget[order.index(0)] < 0.3 * nugget[order.index(1)]
+
+
+def test_a_step_of_noise_does_not_decide_on_the_order():
+    series = sample_series("squared_exponential", 0.3)
+    rough = series[..., :1] + 0.1 * torch.from_numpy(np.random.default_rng(0).standard_normal((8, len(GRID), 1)))
+    series[:, -1:] = torch.from_numpy(np.random.default_rng(1).standard_normal((8, 1, 2)))
+    assert smoothest_first(torch.cat([rough, series[..., 1:]], dim=2)).tolist() == [1, 0]
+    assert smoothest_first(series[:, :2]).tolist() == [0, 1]
 
 
 def whole_correlation(along):

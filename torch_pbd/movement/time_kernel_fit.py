@@ -28,8 +28,7 @@ _ROUNDS = 3  # alternations of nuggets and length scale, which depend on each ot
 # Nats a demonstration. Kernels that a step of noise had decided on lost 14 to 99, of recordings others gained up to 9
 # and left-out demonstrations nothing.
 _CLEARLY = 10.0
-# Of outputs whose mean square second differences are within such a factor the first given comes first.
-_ROUGHER = 4.0
+_ROUGHER = 4.0  # factor of squared second differences above the smoothest output's; less puts no output after others
 _SHARES = (1.0, 0.9, 0.75, 0.6, 0.45, 0.3, 0.2, 0.1, 0.05)  # candidate weights of the kernel in the correlation
 
 
@@ -213,10 +212,12 @@ def smoothest_first(residual: Float[Tensor, "K T d"]) -> Int64[Tensor, " d"]:
     """Order in which each output is given those before it, by residuals over their deviations at each step.
 
     What trembles in one is passed on to those after it as far as they vary together, and draws of smooth outputs given
-    a rough one would be as rough.
+    a rough one would be as rough. Steps of noise, as where movements end at one point, do not decide on a median.
     """
-    bend = residual.diff(n=2, dim=1).square().nanmean((0, 1)) / residual.square().nanmean((0, 1))
-    bend = bend.nan_to_num(nan=1.0).clamp_min(_LEAST)  # of a constant output, or fewer than three steps
+    if residual.shape[1] < 3:
+        return torch.arange(residual.shape[2])
+    bend, size = (part.square().nanmean(0).nanmedian(0).values for part in (residual.diff(n=2, dim=1), residual))
+    bend = (bend / size).nan_to_num(nan=1.0, posinf=1.0).clamp_min(_LEAST)  # of a constant output
     return ((bend / bend.min()).log() / math.log(_ROUGHER)).floor().argsort(stable=True)
 
 

@@ -35,8 +35,8 @@ class TrajectoryLaw(nn.Module):
     """Joint law of a movement, as a torch module: differentiable in the times.
 
     With marginals of mean m_t and covariance ``C_t = L_t L_t'``, L_t triangular with the outputs in ``order``, the
-    correlation R_j of the time kernel of each output and the whitened residuals z_k of K demonstrations, the covariance
-    is ``Sigma = A S A'`` with ``S = w blockdiag(R_1, R_2, ...) + (1 - w) / K sum_k z_k z_k'`` and
+    correlation R_j of the time kernel of each in that order and the whitened residuals z_k of K demonstrations, the
+    covariance is ``Sigma = A S A'`` with ``S = w blockdiag(R_1, R_2, ...) + (1 - w) / K sum_k z_k z_k'`` and
     ``A_t = L_t chol(S_tt)^-1``, so that its blocks ``Sigma_tt`` are the marginals' C_t.
     """
 
@@ -75,10 +75,8 @@ class TrajectoryLaw(nn.Module):
 
 
 def root_in_order(covariance: Float[Tensor, "n d d"], order: Int64[Tensor, " d"]) -> Float[Tensor, "n d d"]:
-    """Roots of covariances in which each output is given those before it in an order, lower triangular in that."""
-    root = safe_cholesky(covariance[:, order][:, :, order], name="the covariance at a step")
-    back = order.argsort()
-    return root[:, back][:, :, back]
+    """Roots of covariances, whose column k is what output ``order[k]`` has beyond those before it."""
+    return safe_cholesky(covariance[:, order][:, :, order], name="the covariance at a step")[:, order.argsort()]
 
 
 @dataclass(eq=False, repr=False)
@@ -188,7 +186,7 @@ class TrajectoryRegressor(TimedMovement):
         kernels = ("matern52", "squared_exponential") if self.time_kernel == "auto" else (self.time_kernel,)
         share = None if self.shrinkage == "auto" else 1.0 - float(self.shrinkage)
         scaled = torch.from_numpy((grid - low) / width)
-        found = fit_time_kernel(scaled, whitened, root.diagonal(dim1=1, dim2=2), kernels, share)
+        found = fit_time_kernel(scaled, whitened, root[:, order].diagonal(dim1=1, dim2=2), kernels, share)
         self._set_law(found, order)
         degrees = self.regressor_.predict_df(grid[:, np.newaxis])
         self.df_ = float(np.clip(np.median(degrees) / _WHOLE, _FEWEST_DF, _MOST_DF))
@@ -196,8 +194,12 @@ class TrajectoryRegressor(TimedMovement):
 
     def _set_law(self, kernel: TimeKernel, order: Tensor) -> None:
         self.module_ = TrajectoryLaw(getattr(self.regressor_, "module_", None), kernel, order, *self._range)
-        self.length_scale_, self.shrinkage_ = self._range[1] * kernel.scales[:, 0].numpy(), 1.0 - float(kernel.share)
-        self.nugget_scale_ = np.sqrt(kernel.nugget.numpy().T)
+        of_output = order.argsort()
+        self.length_scale_, self.shrinkage_ = (
+            self._range[1] * kernel.scales[of_output, 0].numpy(),
+            1.0 - float(kernel.share),
+        )
+        self.nugget_scale_ = np.sqrt(kernel.nugget[of_output].numpy().T)
 
     def predict(self, X: ArrayLike, *, return_std: bool = False, return_cov: bool = False) -> Any:
         """Prediction of the regressor, or after :meth:`condition` mean and covariance of the rest of the movement."""
