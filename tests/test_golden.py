@@ -90,10 +90,9 @@ def test_44_each_file_is_one_of_these(folder):
 
 
 def test_what_is_learned_is_what_it_was():
-    """Rounding of y, 1e-15 of it, moves these by 8e-11 at most; another processor's rounding may do more to two."""
+    """Rounding of y, 1e-15 of it, moves these by 8e-11 at most, and another processor's two of them by more."""
     rtols = {
-        # Slopes of its evidence round to 1e-8 by the instructions of the processor: searches end elsewhere, as far as
-        # moves these by 1e-6.
+        # Gradients of its evidence have eight digits: by a processor's instructions predictions differ by 1e-6.
         "HeteroscedasticGPRegressor": 1e-5,
         # Expectation maximization ends at a gain of so little that rounding moves it by 4e-7.
         "GMMBaseline": 1e-5,

@@ -9,7 +9,7 @@ from torch.distributions import MultivariateNormal, kl_divergence
 
 from torch_pbd.models.heteroscedastic import log_variance
 from torch_pbd.models.heteroscedastic.log_variance import Squares
-from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation, bands
+from torch_pbd.models.heteroscedastic.whitening import NoiseCorrelation, bidiagonal
 
 INDEPENDENT = None
 
@@ -87,7 +87,7 @@ def test_gradient_of_the_evidence(correlated, family, inputs, rng):
     """The mean is at its maximum: its derivative does not enter (the envelope)."""
     copies = torch.tensor(rng.uniform(1.0, 3.0, size=(2, 9)))
     whitener = torch.tensor(np.tril(rng.normal(size=(2, 9, 9)), -1) + np.eye(9))
-    whitener = bands(whitener.triu(-1)) if correlated == "along a line" else whitener
+    whitener = bidiagonal(whitener.triu(-1)) if correlated == "along a line" else whitener
     assert whitener.shape[-1] == (2 if correlated == "along a line" else 9)
     squares = squares_at(9, rng, noise=NoiseCorrelation(whitener, copies) if correlated else INDEPENDENT)
     theta = torch.tensor([[-1.0, 0.3], [-0.4, -0.6]], dtype=torch.float64)

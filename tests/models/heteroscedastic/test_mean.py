@@ -5,9 +5,9 @@ from scipy.linalg import block_diag
 
 from torch_pbd.kernels import correlation
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily
-from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation, bands
 from torch_pbd.models.heteroscedastic.search import Search, SearchOptions
 from torch_pbd.models.heteroscedastic.steps import fit_mean
+from torch_pbd.models.heteroscedastic.whitening import NoiseCorrelation, bidiagonal
 from torch_pbd.models.training import TrainingSet
 
 
@@ -38,7 +38,7 @@ def test_the_mean_is_a_dense_regression_of_all_outputs_under_their_noise(d, whit
     counts = rng.integers(1, 6, size=n)
     along = np.exp(-np.abs((inputs - inputs.T).numpy()) / 0.2) if whitened else np.eye(n)
     whitener = torch.tensor(np.linalg.inv(np.linalg.cholesky(along))).expand(d, n, n)
-    whitener = bands(whitener) if whitened == "by bands" else whitener
+    whitener = bidiagonal(whitener) if whitened == "by bands" else whitener
     roots = block_diag(*(tril / np.sqrt(counts)[:, np.newaxis, np.newaxis]))
     noise = roots @ np.kron(along, np.eye(d)) @ roots.T
     means = np.sin(3.0 * inputs.numpy() + np.arange(d)) + 0.3 * rng.normal(size=(n, d))

@@ -5,7 +5,7 @@ from scipy.linalg import block_diag
 from scipy.stats import multivariate_normal
 
 from torch_pbd.models.heteroscedastic.regression import Regression
-from torch_pbd.models.heteroscedastic.residuals import bands
+from torch_pbd.models.heteroscedastic.whitening import bidiagonal
 
 # A ridge of 1e-8 beside the standardized outputs' scatter keeps it regular, and moves results by as much.
 RTOL = 1e-6
@@ -57,7 +57,7 @@ def whitener_of(whitened):
     """Inverse factor of the correlation; of independent inputs its diagonal."""
     if whitened is None:
         return INDEPENDENT
-    return bands(torch.tensor(np.linalg.inv(np.linalg.cholesky(correlations(whitened)))))
+    return bidiagonal(torch.tensor(np.linalg.inv(np.linalg.cholesky(correlations(whitened)))))
 
 
 @pytest.mark.parametrize("whitened", [None, "markov", "smooth"])
@@ -135,3 +135,5 @@ def test_the_weights_are_those_of_the_design_whose_precision_is_too_large_to_for
     features = torch.tensor(rng.normal(size=(1, 3, 2)))
     by_blocks, by_design = (known.fit(scale * features) for scale in (1e3, 1e5))
     torch.testing.assert_close(by_blocks.mean / 1e2, by_design.mean, rtol=1e-5, atol=1e-10)
+    both = known.fit(torch.cat([1e3 * features, 1e5 * features])).value  # all by the design, for the second
+    torch.testing.assert_close(both[0], by_blocks.value[0], rtol=1e-6, atol=0)

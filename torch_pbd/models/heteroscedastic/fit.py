@@ -25,13 +25,13 @@ from torch_pbd.models.heteroscedastic.residuals import (
     LAGS,
     NOT_WHITE,
     DemonstrationCorrelation,
-    NoiseCorrelation,
     demonstration_correlation,
     is_signal,
     quantum,
 )
 from torch_pbd.models.heteroscedastic.search import Families, Search, SearchOptions, on_stretched_inputs, stretched
 from torch_pbd.models.heteroscedastic.steps import MOST_INPUTS, CovarianceSearch, fit_covariance, fit_mean, mean_start
+from torch_pbd.models.heteroscedastic.whitening import NoiseCorrelation
 from torch_pbd.models.training import TrainingSet, pooled_tril
 from torch_pbd.optim.batch import Progress
 

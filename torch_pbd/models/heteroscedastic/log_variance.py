@@ -13,7 +13,7 @@ from torch import Tensor
 from torch_pbd.linalg import safe_cholesky
 from torch_pbd.models.heteroscedastic.processes import Evidence, FixedFeatures, Gradient
 from torch_pbd.models.heteroscedastic.regression import LinearEvidence, log_det, weights_factor
-from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation, whiten, whiten_vjp
+from torch_pbd.models.heteroscedastic.whitening import NoiseCorrelation, whiten, whiten_vjp
 from torch_pbd.models.training import TrainingSet
 
 LEAST_SQUARE = 1e-6

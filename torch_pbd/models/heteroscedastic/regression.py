@@ -1,6 +1,6 @@
 """Linear models whose weights are standard normal numbers a priori, and regressions of an output on those before it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torch_pbd.linalg import safe_cholesky, symmetrize, triangular_inverse
-from torch_pbd.models.heteroscedastic.residuals import neighbours, whiten, whiten_vjp
+from torch_pbd.models.heteroscedastic.whitening import tridiagonal, whiten, whiten_vjp
 
 # Of a weight; that of its prior is one, of which a sum with a larger one keeps fewer than seven digits.
 _LARGEST_PRECISION = 1e9
@@ -187,7 +187,7 @@ class Regression:
 
         None where inputs are coupled with others too.
         """
-        if (weights := neighbours(self.whitener)) is None:
+        if (weights := tridiagonal(self.whitener)) is None:
             return None
         (own, beside), n = weights, len(self.root)
         after = self.root[n - len(beside) :].mT
@@ -200,7 +200,8 @@ class Regression:
         if self.couplings is not None:
             of_each = features.unsqueeze(1).expand(-1, self.size, -1, -1)
             if (linear := LinearEvidence.fit_blocks(*self.couplings, of_each, self.cross)) is not None:
-                return linear
+                # Less y'y, as of the design, or values of a search would jump where digits end.
+                return replace(linear, value=linear.value - 0.5 * whiten(self.whitener, self.response).square().sum())
         return LinearEvidence.fit(*self._design(features))
 
     def gradient(self, linear: LinearEvidence, features: Float[Tensor, "b n p"]) -> Float[Tensor, "b n p"]:

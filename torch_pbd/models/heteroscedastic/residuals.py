@@ -4,15 +4,14 @@ demonstration do.
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
-from torch.nn.functional import pad
 from torch.nn.utils.rnn import pad_sequence
 
 from torch_pbd.linalg import safe_cholesky, triangular_inverse
+from torch_pbd.models.heteroscedastic.whitening import NoiseCorrelation, bidiagonal
 from torch_pbd.models.training import TrainingSet
 
 LAGS = 3
@@ -34,7 +33,6 @@ _STRONG, _OF_NEIGHBOURS = 0.5, 0.5
 _SMOOTH = 0.2  # of the variance of third differences of independent means
 _SHARE_OF_THIRD = 0.433  # independent ones among third differences of white noise: 20^2 / (20^2 + 2 (15^2 + 6^2 + 1))
 _CONSTANT = 1e-20  # variance of an output that does not vary
-_NO_NEIGHBOUR = 1e-9  # share of a whitener's diagonal that is rounding between inputs that do not adjoin
 _LEAST = 1e-300  # a divisor that is zero gives zero and not NaN
 
 # Differences below this share of an output's largest value are floating point's. So many others, all multiples of the
@@ -131,54 +129,6 @@ def quantum(y: Float[Tensor, "rows d"]) -> Float[Tensor, " d"]:
     return torch.tensor(steps).to(y)
 
 
-class NoiseCorrelation(NamedTuple):
-    """Correlation of means, or of mean squares, of each output at n inputs."""
-
-    whitener: Float[Tensor, "d n m"]
-    """W, that makes them independent, of the variances of independent rows' ones: see :func:`whiten`."""
-    copies: Float[Tensor, "d n"]
-    """Rows at each input that count for one."""
-
-
-def bands(matrix: Float[Tensor, "*b n n"]) -> Float[Tensor, "*b n m"]:
-    """Whitener of the form that :func:`whiten` takes, of a lower triangular matrix.
-
-    Along a line an exponential correlation is that of a Markov process: a sample depends on the one before alone.
-    """
-    own, before = matrix.diagonal(dim1=-2, dim2=-1), matrix.diagonal(-1, dim1=-2, dim2=-1)
-    if bool(matrix.tril(-2).abs().max() > _NO_NEIGHBOUR * own.min()):
-        return matrix
-    return torch.stack([own, pad(before, (1, 0))], dim=-1)
-
-
-def whiten(whitener: Float[Tensor, "*#b n m"], values: Float[Tensor, "*#b n p"]) -> Float[Tensor, "... n p"]:
-    """Product W v. Of a lower triangular W there is the matrix (m = n), or where it has no more, as along a line, its
-    diagonal and what is before that (m = 2), or the diagonal alone (m = 1).
-    """
-    if whitener.shape[-1] > 2:
-        return whitener @ values
-    own = whitener[..., :1] * values
-    return own if whitener.shape[-1] == 1 else own + whitener[..., 1:] * values.roll(1, -2)
-
-
-def whiten_vjp(whitener: Float[Tensor, "*#b n m"], gradient: Float[Tensor, "*#b n p"]) -> Float[Tensor, "... n p"]:
-    """Product W'g."""
-    if whitener.shape[-1] > 2:
-        return whitener.mT @ gradient
-    own = whitener[..., :1] * gradient
-    return own if whitener.shape[-1] == 1 else own + (whitener[..., 1:] * gradient).roll(-1, -2)
-
-
-def neighbours(whitener: Float[Tensor, "*b n m"]) -> tuple[Float[Tensor, "*b n"], Float[Tensor, "*b k"]] | None:
-    """Diagonal of W'W and, k of n - 1, what is beside it; None where there is more."""
-    if whitener.shape[-1] > 2:
-        return None
-    own, before = whitener[..., 0], whitener[..., 1:, 1:].flatten(-2)
-    if whitener.shape[-1] == 1:
-        return own.square(), before
-    return own.square() + pad(before.square(), (0, 1)), before * own[..., 1:]
-
-
 @dataclass(frozen=True)
 class DemonstrationCorrelation:
     """Correlation of the whitened residuals of one demonstration, ``exp(-distance / (2 * decay))``.
@@ -208,7 +158,7 @@ class DemonstrationCorrelation:
         correlation = shared * torch.exp(-distance / (decay if squares else 2.0 * decay))
         matrix = torch.where(self.decay[:, None, None] > 0, correlation, torch.eye(len(inputs)).to(inputs))
         factor = safe_cholesky(matrix, name="the correlation of the demonstrations")
-        return NoiseCorrelation(bands(triangular_inverse(factor)), matrix.diagonal(dim1=1, dim2=2))
+        return NoiseCorrelation(bidiagonal(triangular_inverse(factor)), matrix.diagonal(dim1=1, dim2=2))
 
 
 def demonstration_correlation(

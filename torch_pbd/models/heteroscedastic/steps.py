@@ -26,8 +26,8 @@ from torch_pbd.models.heteroscedastic.log_variance import (
 from torch_pbd.models.heteroscedastic.posterior import LatentCovariance, LatentMean
 from torch_pbd.models.heteroscedastic.processes import CLEAR, FixedFeatures, Gradient, inducing_inputs
 from torch_pbd.models.heteroscedastic.regression import LinearEvidence, Regression, Weights
-from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation, neighbours, whiten, whiten_vjp
 from torch_pbd.models.heteroscedastic.search import Families, Search, SearchOptions
+from torch_pbd.models.heteroscedastic.whitening import NoiseCorrelation, tridiagonal, whiten, whiten_vjp
 from torch_pbd.models.training import TrainingSet, pooled_tril
 
 MOST_INPUTS = 1024
@@ -87,7 +87,7 @@ def _fit_outputs(
 ) -> LinearEvidence:
     """Posterior of the weights of all outputs together."""
     response = whiten(whitener, (whitening @ means.unsqueeze(-1)).transpose(0, 1))
-    if (weights := neighbours(whitener)) is not None:
+    if (weights := tridiagonal(whitener)) is not None:
         own, beside = (part.mT.unsqueeze(-1) * whitening[len(whitening) - part.shape[1] :] for part in weights)
         first = whitening[: len(beside)]
         weighted = whiten_vjp(whitener, response).transpose(0, 1)
