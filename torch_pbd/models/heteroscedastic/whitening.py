@@ -1,8 +1,8 @@
 """Whiteners: lower triangular matrices W that make correlated noise independent and of variance one.
 
 Along a line an exponential correlation is that of a Markov process, in which a sample depends on the one before alone:
-W is bidiagonal and W'W tridiagonal. W is stored as the matrix (n, n), n > 2; as its diagonal and subdiagonal (n, 2), with
-a zero before the first; or as its diagonal (n, 1).
+W is bidiagonal and W'W tridiagonal. W is stored as the matrix (n, n), n > 2; as its diagonal and subdiagonal (n, 2),
+which begins with a zero; or as its diagonal (n, 1).
 """
 
 from typing import NamedTuple
