@@ -62,15 +62,22 @@ def test_is_not_changed_through_the_callers_arrays_or_its_own(rng):
             held[0].position.setflags(write=True)
 
 
-def test_read_only_arrays_of_the_caller_are_copied_and_what_is_held_already_is_not(ragged):
+def _flagged(array):
+    array.setflags(write=False)
+    return array
+
+
+@pytest.mark.parametrize("read_only", [_flagged, lambda array: np.asarray(array.data.toreadonly())])
+def test_read_only_arrays_of_the_caller_are_copied(read_only):
     time, position = np.arange(5.0), np.ones((5, 1))
-    for array in (time, position):
-        array.setflags(write=False)
-    demonstrations = Demonstrations([time], [position])
+    demonstrations = Demonstrations([read_only(time)], [read_only(position)])
     for array in (time, position):
         array.setflags(write=True)
         array[:] = 7.0
     assert demonstrations == Demonstrations(np.arange(5.0), np.ones((1, 5, 1)))
+
+
+def test_what_is_held_already_is_not_copied(ragged):
     assert all(a is b for a, b in zip(ragged[1:].positions, ragged.positions[1:], strict=True))
     wanted = Wanted(rate=1.0)
     read = wanted.read_each(wanted.choose({"x": ["x"]}), [{"x": np.arange(3.0)}])["positions"]
