@@ -101,13 +101,77 @@ def test_an_unlikely_point_of_one_output_moves_the_others_no_more_than_is_likely
 
 def test_an_error_of_the_robot_is_no_deviation_of_people():
     """A millimetre off where demonstrations agree to micrometres: told, and with the robot's error no matter."""
-    controller = DMPController(TrajectoryRegressor()).fit(make_tunnel_demonstrations(random_state=0).resample(60))
-    time, X = np.array([5.0]), np.linspace(0.0, 10.0, 21)[:, np.newaxis]
+    shown = make_tunnel_demonstrations(random_state=0).resample(60).in_units(time_unit="ms")
+    controller = DMPController(TrajectoryRegressor()).fit(shown)
+    time, X = np.array([5000.0]), np.linspace(0.0, 10000.0, 21)[:, np.newaxis]
     position = controller.predict(time[:, np.newaxis]) + np.array([0.0, 1e-3])
-    with pytest.warns(UserWarning, match=r"positions\[0, 1\] is \d+ standard deviations .* Give noise_scale"):
+    with pytest.warns(UserWarning, match=r"y of positions, at 5000 ms, is \d+ standard deviations .* Give noise_scale"):
         controller.condition(time, position)
     bent = controller.condition(time, position, noise_scale=1e-3)  # and no warning, which would be an error
     np.testing.assert_allclose(bent.predict(X), controller.predict(X), rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("noise_scale", "message"),
+    [
+        ("a", "noise_scale holds text"),
+        (None, "noise_scale is nan, must be a finite number of at least 0"),
+        ([0.0, -1.0], r"noise_scale\[1\] is -1.0, must be"),
+        ([0.1, 0.2, 0.3], r"noise_scale has shape \(3,\), must be one number or have shape \(2,\)"),
+    ],
+)
+def test_noise_is_checked_before_it_is_used(controller, noise_scale, message):
+    with pytest.raises(ValueError, match=message):
+        controller.condition([1.0], [controller.goal_], noise_scale=noise_scale)
+
+
+def test_nothing_to_condition_on_changes_nothing(controller):
+    plain = controller.schedule(rate=100.0)
+    for bent in (
+        controller.schedule(rate=100.0, goal=controller.goal_),
+        controller.schedule(rate=100.0, start=controller.start_),
+        controller.schedule(rate=100.0, via=[]),
+        controller.condition([], np.zeros((0, 2))).schedule(rate=100.0),
+    ):
+        np.testing.assert_allclose(bent.position, plain.position, rtol=0, atol=1e-12)
+    assert controller.predict_cov(np.zeros((0, 1))).shape == (0, 2, 2)
+
+
+@pytest.mark.filterwarnings("ignore:via", "ignore:The reproduced movement is")
+@pytest.mark.parametrize("phase_input", ["time", "s", "log_s"])
+def test_what_is_known_stays_where_an_unlikely_point_follows(phase_input):
+    controller = DMPController(TrajectoryRegressor(), phase_input=phase_input).fit(demonstrations())
+    time = np.linspace(0.0, 0.8, 9)
+    pushed = controller.predict(time[:, np.newaxis]) + np.array([0.005, 0.0])
+    known = controller.condition(time, pushed, noise_scale=1e-3)
+    pushed_on = controller.predict([[1.0]])[0, 0] + 0.01
+    known = known.condition([1.0], [[pushed_on, np.nan]])
+    before = known.schedule(rate=100.0).position
+    bent = known.schedule(rate=100.0, via=[(1.5, before[150] + [0.3, np.nan])]).position
+    np.testing.assert_allclose(bent[150, 0], before[150, 0] + 0.3, rtol=0, atol=1e-4)
+    np.testing.assert_allclose([before[100, 0], bent[100, 0]], pushed_on, rtol=0, atol=1e-5)
+    # The past moves by no more than its noise: the likely share of the change is conditioned on, as before.
+    np.testing.assert_allclose(bent[:81], before[:81], rtol=0, atol=2e-3)
+
+
+@pytest.mark.filterwarnings("ignore:via")
+def test_an_output_that_is_free_at_a_point_passes_it_as_if_it_were_not_there(controller):
+    place = controller.schedule(rate=100.0).position
+    one = controller.schedule(rate=100.0, via=[(1.0, place[100] + [0.3, np.nan])])
+    two = controller.schedule(
+        rate=100.0, via=[(1.0, place[100] + [0.3, np.nan]), (1.1, [np.nan, one.position[110, 1]])]
+    )
+    np.testing.assert_allclose(two.position, one.position, rtol=0, atol=1e-3)
+
+
+@pytest.mark.filterwarnings("ignore:via")
+def test_points_at_one_time_are_one_point(controller):
+    place, late = controller.predict([[1.0]])[0] + [0.3, 0.2], 1.0 + 1e-10
+    whole = controller.schedule(rate=100.0, via=[(1.0, place)])
+    for via in ([(1.0, [place[0], np.nan]), (late, [np.nan, place[1]])], [(1.0, place), (late, place)]):
+        np.testing.assert_allclose(
+            controller.schedule(rate=100.0, via=via).position, whole.position, rtol=0, atol=1e-12
+        )
 
 
 def test_a_movement_that_was_pushed_goes_on_from_where_it_is(controller):
@@ -162,7 +226,10 @@ def test_any_model_of_movements_bends(controller):
         ([1.0], "via\\[0\\] is 1.0, must be a time in s and a position"),
         (1.0, "via is 1.0, must be a list of pairs, each a time in s and a position"),
         (np.array([[1.0, 0.2, 0.1]]), "via\\[0\\] is array.*, must be a time in s and a position"),
-        ([(1.0, [0.2, 0.1]), (1.0, [0.2, 0.1])], "given twice"),
+        (
+            [(0.5, [0.2, 0.1]), (1.0, [0.2, np.nan]), (1.0 + 1e-10, [0.3, 0.1])],
+            "y0 of via\\[2\\] is 0.3, must be 0.2 as of via\\[1\\], which is at the same time, 1 s: leave one",
+        ),
     ],
 )
 def test_via_points_are_checked(controller, via, message):

@@ -113,8 +113,9 @@ class Planning(BaseEstimator):
             Positions in the units of the recordings, NaN where an output is not given. Poses are p positions and a
             quaternion w x y z, or outputs; a rotation is given as a whole or not at all.
         noise_scale : float or array-like of shape (d,), default=0.0
-            Standard deviation of the error of positions, for poses p numbers in their units and three in rad. A robot
-            has one: where demonstrations agree to less, other outputs are moved far without it, which warns.
+            Standard deviation of the error of positions, for poses p numbers in their units and three in rad. Positions
+            that a robot measured have one, such as 1 mm. Taken as exact where demonstrations agree to much less, they
+            are a large deviation, with which other outputs may move far; this warns.
         """
         time = self._movement_time(checks.array(times, "times", ("m",))[:, np.newaxis])
         position = self.outputs_.rows(positions, "positions")

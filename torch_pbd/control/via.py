@@ -2,7 +2,8 @@
 
 A conditioned model of whole movements predicts how the rest of a movement changes. That change, over movement time, is
 added to the reproduced path; gains come from the conditioned covariance. Goals that the demonstrations make unlikely
-are left to the movement primitive, which reaches any goal; what is unlikely of via points, to minimum jerk.
+are left to the movement primitive, which reaches any goal; what is unlikely of via points, to quintics of minimum jerk
+from rest to rest: the change that they add has no velocity and no acceleration at any point.
 """
 
 import copy
@@ -16,6 +17,7 @@ from scipy.stats import f
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
+from torch_pbd.exceptions import InvalidParameterError
 
 _N_KNOTS = 200  # knots of a change over a movement, whose length scales are at least a fiftieth of it
 # Standard deviations beyond which nobody deviates: steps of left-out demonstrations were up to 23 away.
@@ -45,14 +47,16 @@ def conditioned(
     # Observations are in outputs, any of which may be free, while poses are learned along other axes.
     model = controller.covariance_.observed_along(outputs.axes)
     shown, inputs, stays = getattr(controller, "_shown", model), phase(time), phase(np.array(pins))
-    _warn_of_far(change, outputs.covariance(shown.predict_cov(inputs)), noise_scale)
     bent = model.condition(inputs, outputs.decode(model.predict(inputs)) + change, noise_scale=noise_scale)
+    if len(time):
+        _warn_of_far(controller, time, change, outputs.covariance(shown.predict_cov(inputs)), noise_scale)
     moved = bent.condition(stays, outputs.decode(model.predict(stays))) if len(pins) else bent
-    # Knots are even, except next to observed times, where the change must be exact.
-    own = np.append(time, pins).clip(0.0, controller.duration_)
+    # Knots are even, except next to observed times, of now and before, where the change must be exact.
+    own = np.append(controller.reproduction_.time_of(bent._known.time), pins).clip(0.0, controller.duration_)
     even = np.linspace(0.0, controller.duration_, _N_KNOTS)
     far = np.abs(even[:, np.newaxis] - own).min(axis=1, initial=np.inf) > 0.25 * even[1]
     knots = np.unique(np.append(even[far], own))
+    knots = knots[np.diff(knots, prepend=-np.inf) > _rounding(controller)]
     result = copy.copy(controller)
     result.covariance_, result._shown = bent, shown
     result.reproduction_ = copy.copy(controller.reproduction_)
@@ -61,15 +65,17 @@ def conditioned(
     return result
 
 
-def _warn_of_far(change: Floats, covariance: Floats, noise_scale: ArrayLike) -> None:
+def _warn_of_far(controller: Any, time: Floats, change: Floats, covariance: Floats, noise_scale: ArrayLike) -> None:
     """Warn of changes (m, d), NaN where free, that are no deviation of people but an error of a robot, or of units."""
     variance = np.diagonal(covariance, axis1=1, axis2=2) + np.square(noise_scale)
     far = np.nan_to_num(np.abs(change) / np.sqrt(variance.clip(np.finfo(float).tiny)))
-    row, output = np.unravel_index(far.argmax(), far.shape) if far.size else (0, 0)
-    if far.size and far[row, output] > _FAR:
+    row, output = np.unravel_index(far.argmax(), far.shape)
+    if far[row, output] > _FAR:
+        at = time[row] / controller.time_scale_ + controller.start_time_  # as the caller gave it
         checks.warn(
-            f"positions[{row}, {output}] is {far[row, output]:.3g} standard deviations from the movement: others "
-            "move as far along a correlation that is hardly known. Give noise_scale, the robot's error, or mend units."
+            f"{controller.names_[output]} of positions, at {at:g} {controller.time_unit_}, is {far[row, output]:.3g} "
+            "standard deviations from the movement: other outputs may then move as far. Give noise_scale, the robot's "
+            "error in the units of positions, or correct the units."
         )
 
 
@@ -79,13 +85,13 @@ def planned(
     """Controller conditioned on a goal, a start and via points, and the goal and start left to its primitive.
 
     A point that deviates by more than 95 % of demonstrations raises a warning and is passed all the same. What is
-    beyond these changes the given outputs alone, by minimum jerk: a correlation that is hardly known, times thousands
-    of standard deviations, would move the others by metres.
+    beyond these changes the given outputs alone, as :func:`_rest_to_rest` has it: a correlation that is hardly known,
+    times thousands of standard deviations, would move the others by metres.
     """
     if via is None and (not can_bend(controller) or (goal is None and start is None)):
         return controller, goal, start
     can_bend(controller, must=True)
-    points = _checked_points(via, controller)
+    points = _one_each_time(_checked_points(via, controller), controller)
     rest, known, pins = {"goal": goal, "start": start}, [], []
     for name, at, own in (("start", 0.0, controller.start_), ("goal", controller.duration_, controller.goal_)):
         target = rest[name]
@@ -102,22 +108,48 @@ def planned(
     path = (
         CubicSpline(even, controller.reproduction_.plan(even, rest["goal"], rest["start"], 1.0)[0]) if points else None
     )
-    zero = np.zeros(controller.n_outputs_)
-    beyond = {0.0: zero, controller.duration_: zero}  # by movement time
-    for number, (at, position) in enumerate(points):
+    beyond = []
+    for number, (at, position) in points.items():
         change = position - path(at)
         share = _likely_share(controller, at, change, f"via[{number}]")
         known.append((at, share * change))
-        beyond[at] = (1.0 - share) * np.nan_to_num(change)
+        beyond.append((at, (1.0 - share) * change))
     times, changes = np.array([at for at, _ in known]), [change for _, change in known]
     # A controller that was conditioned may know its start or its end already.
     phase, before = controller.reproduction_.phase, controller.covariance_._known.time
-    pins = [at for at in pins if at not in times and not np.isclose(phase(np.array([at]))[0, 0], before).any()]
+    pins = [at for at in pins if not (np.abs(times - at) <= _rounding(controller)).any()]
+    pins = [at for at in pins if not np.isclose(phase(np.array([at]))[0, 0], before).any()]
     bent = conditioned(controller, times, np.reshape(changes, (-1, controller.n_outputs_)), pins=pins)
-    jerk = BPoly.from_derivatives(sorted(beyond), [(beyond[at], zero, zero) for at in sorted(beyond)])
     likely = bent.reproduction_.bend
-    bent.reproduction_.bend = CubicSpline(likely.x, likely(likely.x) + jerk(likely.x))
+    changes = likely(likely.x) + _rest_to_rest(controller, beyond, likely.x)
+    bent.reproduction_.bend = CubicSpline(likely.x, changes)
     return bent, rest["goal"], rest["start"]
+
+
+def _rest_to_rest(controller: Any, beyond: list[tuple[float, Floats]], time: Floats) -> Floats:
+    """Changes (n, d) at movement times (n,): those ``beyond``, NaN where free, and none at ends and known values.
+
+    Each output goes alone, between its own points by quintics, which are of minimum jerk from rest to rest.
+    """
+    known, duration = controller.covariance_._known, controller.duration_
+    changes = np.zeros((len(time), controller.n_outputs_))
+    is_known = ~np.isnan(known.value.reshape(-1, controller.n_outputs_))
+    still = np.append(controller.reproduction_.time_of(known.time).clip(0.0, duration), [0.0, duration])
+    for output in range(controller.n_outputs_):
+        own = {at: change[output] for at, change in beyond if not np.isnan(change[output])}
+        # A via point takes the place of an end, and of what was known with noise.
+        kept = (np.abs(still[:, np.newaxis] - [*own]) > _rounding(controller)).all(axis=1)
+        kept[:-2] &= is_known[:, output]
+        own |= dict.fromkeys(still[kept].tolist(), 0.0)
+        points = sorted(own.items())
+        curve = BPoly.from_derivatives([at for at, _ in points], [(change, 0.0, 0.0) for _, change in points])
+        changes[:, output] = curve(time)
+    return changes
+
+
+def _rounding(controller: Any) -> float:
+    """Difference in s of movement times that count as one."""
+    return checks.ROUNDING * float(controller.duration_)
 
 
 def _checked_points(via: Any, controller: Any) -> list[tuple[float, Floats]]:
@@ -137,6 +169,24 @@ def _checked_points(via: Any, controller: Any) -> list[tuple[float, Floats]]:
             raise checks.refusal(position.tolist(), name, f"{n_outputs} numbers, NaN where free")
         points.append((at, position))
     return points
+
+
+def _one_each_time(points: list[tuple[float, Floats]], controller: Any) -> dict[int, tuple[float, Floats]]:
+    """Via points by their numbers, those at one time as one, which is likely or not as a whole."""
+    joined: dict[int, tuple[float, Floats]] = {}
+    for number, (at, position) in enumerate(points):
+        first = next((i for i, (own, _) in joined.items() if abs(at - own) <= _rounding(controller)), number)
+        at, own = joined.get(first, (at, position))
+        rounding = checks.ROUNDING * np.nanmax(np.abs(own))
+        differs = np.abs(position - own) > rounding  # not where either is NaN
+        if differs.any():
+            output = int(differs.argmax())
+            raise InvalidParameterError(
+                f"{controller.names_[output]} of via[{number}] is {position[output]:.10g}, must be {own[output]:.10g} "
+                f"as of via[{first}], which is at the same time, {at:g} s: leave one of them out."
+            )
+        joined[first] = at, np.where(np.isnan(own), position, own)
+    return joined
 
 
 def _likely_share(controller: Any, at: float, change: Floats, name: str = "") -> float:

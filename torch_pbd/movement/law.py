@@ -113,11 +113,14 @@ class MovementLaw(BaseEstimator, ABC):
                 f"y has shape {np.shape(y)}, must have a finite row of {self.n_outputs_} outputs, NaN where not given, "
                 f"for each of the {len(time)} rows of X."
             )
-        scale = np.broadcast_to(checks.real_floats(noise_scale, "noise_scale"), (self.n_outputs_,))
+        scale = checks.real_floats(noise_scale, "noise_scale")
+        if scale.shape not in ((), (self.n_outputs_,)):
+            must = f"must be one number or have shape ({self.n_outputs_},): give one for each output"
+            raise ValueError(f"noise_scale has shape {scale.shape}, {must}.")
         checks.require((scale >= 0.0) & np.isfinite(scale), scale, "noise_scale", "a finite number of at least 0")
         some = ~np.isnan(value).all(axis=1)
         copied = self._copy()
-        copied._known = known = self._known.and_also(time[some], value[some], np.tile(scale, (int(some.sum()), 1)))
+        copied._known = known = self._known.and_also(time[some], value[some], np.broadcast_to(scale, value[some].shape))
         rows, outputs = known.exact.nonzero()
         if len(set(zip(self._rounded(known.time)[rows], outputs, strict=True))) < len(rows):
             raise ValueError("X has a time that is given twice, or is known already, without noise: leave it out.")

@@ -265,4 +265,4 @@ class TrajectoryRegressor(TimedMovement):
 
     def _regressor_rows(self, time: Floats) -> tuple[Floats, Floats]:
         mean, covariance = self.regressor_.predict(time[:, np.newaxis], return_cov=True)
-        return np.ascontiguousarray(mean.reshape(len(time), -1)), np.ascontiguousarray(covariance)
+        return np.ascontiguousarray(mean.reshape(len(time), self.n_outputs_)), np.ascontiguousarray(covariance)

@@ -92,6 +92,14 @@ class Reproduction:
             time = -self.dmp.gamma * time / self.dmp.tau
         return time[:, np.newaxis]
 
+    def time_of(self, phase: Floats) -> Floats:
+        """Movement times (n,) of inputs (n,) of the regressors, the inverse of :meth:`phase`."""
+        if self.phase_input not in _DECAY:
+            return phase
+        # The phase of what is long after the end may be zero.
+        log_phase = np.log(phase.clip(np.finfo(float).tiny)) if self.phase_input == "s" else phase
+        return -self.dmp.tau * log_phase / self.dmp.gamma
+
     def forcing_of(self, movements: Movements) -> Floats:
         """Forcing (K, n, d) that reproduces each movement, eq. (18)."""
         goal = movements.position[:, -1:] if self.own_goals else self.goal
