@@ -19,7 +19,7 @@ from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.console import say
 from torch_pbd.estimators import validation
-from torch_pbd.estimators.door import Integers, Standardization, TorchEstimator
+from torch_pbd.estimators.door import Integers, Standardization, TorchEstimator, row_order
 from torch_pbd.estimators.validation import checked_queries, checked_rows
 from torch_pbd.files.memory import require_much
 from torch_pbd.linalg import gaussian_log_density, student_log_density
@@ -124,11 +124,11 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator):
         self.n_outputs_ = 1 if self._y_is_1d else targets.shape[1]
         targets = targets.reshape(len(inputs), -1, order="F")
         # Rows are sorted, so that results do not depend on the order in which they are given.
-        order = np.lexsort(np.hstack([inputs, targets]).T)
+        order = row_order(inputs, targets)
         numbers = None if groups is None else validation.check_groups(groups, len(inputs))[order]
         with torch.inference_mode(False), torch.enable_grad():
             rows = inputs.T.take(order, axis=1).T, targets.T.take(order, axis=1).T
-            core, scaling, report, self.jitter_ = self._fit(*rows, groups=numbers, recorded=order.argsort())
+            core, scaling, report, self.jitter_ = self._fit(*rows, groups=numbers, order=order)
             units = scaling.x_shift, scaling.x_scale, scaling.y_shift, scaling.y_scale
             self.module_ = ConditionalNormal(core, *map(self._door, units)).requires_grad_(False)
         self.n_iter_ = max(1, report.n_iter)
@@ -143,10 +143,10 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator):
         return self
 
     @abstractmethod
-    def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, recorded: Integers) -> Fit:
+    def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, order: Integers) -> Fit:
         """Fit to validated arrays (n, e) and (n, d).
 
-        ``groups`` has the number of each row's demonstration, ``recorded`` the rows in the order of their recording.
+        ``groups`` has the number of each row's demonstration, ``order`` the place of each in the order of recording.
         """
 
     def _check_parameters(self) -> None:

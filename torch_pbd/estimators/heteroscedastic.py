@@ -168,7 +168,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
             checks.count(self.n_inducing, "n_inducing", least=2)
         checks.count(self.max_inputs, "max_inputs", least=2)
 
-    def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, recorded: Integers) -> Fit:
+    def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, order: Integers) -> Fit:
         if groups is None:
             warn_if_few(len(y), y.shape[1])
         else:
@@ -197,7 +197,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
                 f"length_scale is below {least:.3g} of the range of X, which is what the inputs (or n_inducing of "
                 "them) resolve: between them the covariance says nothing. Give a longer one, or None to learn it."
             )
-        _warn_of_residuals(fit, self._door(recorded).long())
+        _warn_of_residuals(fit, self._door(order.argsort()).long())
         self.effective_share_ = 1.0 if fit.correlation is None else float(fit.correlation.share.mean())
         report = options.outcome(tuple(-value for value in fit.log_evidence))
         return model, scaling, report, ProcessFamily.jitter

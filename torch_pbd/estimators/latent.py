@@ -128,7 +128,7 @@ class LatentCovarianceRegressor(CovarianceRegressor):
                 "solver='fisher' holds the hyperparameters, which latent_prior=False trains: use solver='auto'."
             )
 
-    def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, recorded: Integers) -> Fit:
+    def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, order: Integers) -> Fit:
         scaling, training = self._training_set(X, y)
         counts = training.counts.cpu().numpy()
         aligned = self._works_on_empirical(scaling.in_units(training.inputs.cpu().numpy()), counts, y.shape[1])

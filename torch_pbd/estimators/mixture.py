@@ -80,7 +80,7 @@ class GMMBaseline(CovarianceRegressor):
         checks.choice(self.solver, "solver", ("em", "lbfgs"))
         checks.number(self.reg_covar, "reg_covar", above=0.0)
 
-    def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, recorded: Integers) -> Fit:
+    def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, order: Integers) -> Fit:
         points = _points(X, y)
         n_distinct, n_components = len(distinct_rows(points)[0]), int(self.n_components)
         if n_distinct < self.n_components:
