@@ -28,7 +28,8 @@ _ROUNDS = 3  # alternations of nuggets and length scale, which depend on each ot
 # Nats a demonstration. Kernels that a step of noise had decided on lost 14 to 99, of recordings others gained up to 9
 # and left-out demonstrations nothing.
 _CLEARLY = 10.0
-_ROUGHER = 4.0  # factor of squared second differences above the smoothest output's; less puts no output after others
+# Outputs are sorted in steps of this factor of their squared second differences, counted from the smoothest one's.
+_ROUGHER = 4.0
 _SHARES = (1.0, 0.9, 0.75, 0.6, 0.45, 0.3, 0.2, 0.1, 0.05)  # candidate weights of the kernel in the correlation
 
 

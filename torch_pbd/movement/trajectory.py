@@ -195,10 +195,8 @@ class TrajectoryRegressor(TimedMovement):
     def _set_law(self, kernel: TimeKernel, order: Tensor) -> None:
         self.module_ = TrajectoryLaw(getattr(self.regressor_, "module_", None), kernel, order, *self._range)
         of_output = order.argsort()
-        self.length_scale_, self.shrinkage_ = (
-            self._range[1] * kernel.scales[of_output, 0].numpy(),
-            1.0 - float(kernel.share),
-        )
+        self.length_scale_ = self._range[1] * kernel.scales[of_output, 0].numpy()
+        self.shrinkage_ = 1.0 - float(kernel.share)
         self.nugget_scale_ = np.sqrt(kernel.nugget[of_output].numpy().T)
 
     def predict(self, X: ArrayLike, *, return_std: bool = False, return_cov: bool = False) -> Any:
