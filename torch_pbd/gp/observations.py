@@ -237,16 +237,16 @@ class LatentGP(nn.Module):
         """Mean at x of the processes of ``value_weight``, whose prior mean is zero: what data alone say."""
         return self._weighted(x, self.value_weight)[0]
 
-    def both(self, x: Float[Tensor, "m e"]) -> list[Float[Tensor, "m b"]]:
+    def both(self, x: Float[Tensor, "m e"]) -> Float[Tensor, "2 m b"]:
         """Results of :meth:`forward` and :meth:`values`, by one matrix of correlations."""
         return self._weighted(x, self.weight, self.value_weight)
 
-    def _weighted(self, x: Tensor, *weights: Tensor) -> list[Tensor]:
+    def _weighted(self, x: Tensor, *weights: Tensor) -> Float[Tensor, "w m b"]:
         cross = correlation(x, self.inputs, self.length_scale, self.kernel)
         # Processes that share their length scales share the correlations.
         if len(cross) == 1:
-            return [cross[0] @ weight.mT for weight in weights]
-        return [(cross @ weight.unsqueeze(-1)).squeeze(-1).mT for weight in weights]
+            return (torch.stack(weights) @ cross[0].mT).mT
+        return (torch.stack(weights, dim=1) @ cross.mT).permute(1, 2, 0)
 
     def type1(self, x: Float[Tensor, "m e"]) -> Float[Tensor, " m"]:
         """Type I uncertainty: 0 at the training inputs, 1 where only the prior speaks.

@@ -22,8 +22,12 @@ def with_floor(root: Float[Tensor, "*b d r"]) -> Float[Tensor, "*b d s"]:
 
     It is in the losses as well as in predictions: a likelihood is then bounded, and the fit knows what is predicted.
     """
-    floor = (VARIANCE_FLOOR * (1.0 + root.square().sum((-2, -1), keepdim=True))).sqrt()
-    return torch.cat([root, floor * torch.eye(root.shape[-2], dtype=root.dtype, device=root.device)], dim=-1)
+    return torch.cat([root, floor_of(root).sqrt() * torch.eye(root.shape[-2]).to(root)], dim=-1)
+
+
+def floor_of(root: Float[Tensor, "*b d r"]) -> Float[Tensor, "*b 1 1"]:
+    """Floor under the variances of a root's covariance."""
+    return VARIANCE_FLOOR * (1.0 + root.square().sum((-2, -1), keepdim=True))
 
 
 class Core(nn.Module, ABC):

@@ -14,7 +14,7 @@ from torch_pbd.files.memory import require_memory
 from torch_pbd.gp.observations import Hyperparameters, LatentGP
 from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import scale_tril_from_root, symmetrize
-from torch_pbd.models import Core, MeanAndRoot, PriorTril, Shapes, blank, size_of, with_floor
+from torch_pbd.models import Core, MeanAndRoot, PriorTril, Shapes, blank, floor_of, size_of, with_floor
 from torch_pbd.models.links import CholeskyLink, Link, WishartLink, padded
 
 
@@ -52,10 +52,8 @@ class MeanAndCovariance(Core):
 
     def predict_root(self, x: Float[Tensor, "n e"], prior_tril: PriorTril = None) -> Float[Tensor, "n d r"]:
         """Root of the covariance alone."""
-        deviation, values = self.covariance.latent.both(x)
-        link = self.link(prior_tril)
-        root = link.root(deviation)
-        return link.bounded(root, values) if self.bounded else root
+        link, latent = self.link(prior_tril), self.covariance.latent
+        return link.bounded(latent.both(x)) if self.bounded else link.root(latent(x))
 
     def variability(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d r"]:
         """Root of the covariance with the prior taken out: zero far from data."""
@@ -183,7 +181,8 @@ class ConditionalNormal(nn.Module):
         """
         # By a QR decomposition of the root, whose square is not formed: correlations near one keep their digits.
         mean, root = self.core(self._standardized(x), self._standardized_prior(prior_scale_tril))
-        return self.y_shift + self.y_scale * mean, scale_tril_from_root(self._in_units(root))
+        # The floor comes before the units: relative to all outputs, it would drown one that has a large unit.
+        return self.y_shift + self.y_scale * mean, scale_tril_from_root(self.y_scale[:, None] * with_floor(root))
 
     def moments(self, x: Float[Tensor, "n e"], prior_scale_tril: PriorTril = None) -> tuple[Tensor, Tensor]:
         """Mean (n, d), and covariance (n, d, d), symmetric to the last bit."""
@@ -229,10 +228,6 @@ class ConditionalNormal(nn.Module):
 
     def _square(self, root: Tensor) -> Tensor:
         """Covariance of a root in standardized units, with the floor, in the units of the data."""
-        root = self._in_units(root)
-        return symmetrize(root @ root.mT)
-
-    def _in_units(self, root: Tensor) -> Tensor:
-        """Root of a covariance, with the floor, in the units of the data."""
-        # The floor comes before the units: relative to all outputs, it would drown one that has a large unit.
-        return self.y_scale.unsqueeze(-1) * with_floor(root)
+        covariance = symmetrize(root @ root.mT)
+        covariance.diagonal(dim1=-2, dim2=-1).add_(floor_of(root).squeeze(-1))
+        return self.y_scale[:, None] * self.y_scale * covariance
