@@ -39,7 +39,7 @@ def test_counts_means_and_scatter_are_those_of_numpy(counts, d, rng):
     assert training.counts.tolist() == counts
     assert root.shape[-1] <= d
     for i, (y, w) in enumerate(zip(rows_of(training, training.y), rows_of(training, residual), strict=True)):
-        np.testing.assert_allclose(training.means()[i], y.numpy().mean(0), rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(training.means[i], y.numpy().mean(0), rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(root[i] @ root[i].T, w.T @ w, rtol=1e-9, atol=1e-11)
 
 
@@ -130,7 +130,7 @@ def test_merging_keeps_all_rows_and_their_total(max_inputs, rng):
     assert merged.y is training.y
     assert merged.counts.sum() == training.counts.sum() == 36
     weight = merged.counts[:, None]
-    torch.testing.assert_close((weight * merged.means()).sum(0), training.y.sum(0), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close((weight * merged.means).sum(0), training.y.sum(0), rtol=1e-9, atol=1e-9)
     torch.testing.assert_close((weight * merged.inputs).sum(0), training.x.sum(0), rtol=1e-9, atol=0)
 
 

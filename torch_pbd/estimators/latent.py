@@ -143,7 +143,7 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         if aligned:
             core, report, jitter = self._fit_empirical(problem)
         else:
-            mean, mean_report = self._fit_mean(training)
+            mean, mean_report = self._fit_mean(training, self._mean_job(training))
             core, report, jitter = self._fit_likelihood(problem, mean)
             report = report.after(mean_report, "search of the mean")
         return core, scaling, report, jitter
@@ -195,17 +195,17 @@ class LatentCovarianceRegressor(CovarianceRegressor):
     def _mean_job(self, training: TrainingSet) -> Job:
         """Means at the inputs, weighted by their counts, and the search for their hyperparameters."""
         weights = training.counts / training.counts.mean()
-        observations = Observations(training.inputs, training.means().mT.contiguous(), weights)
+        observations = Observations(training.inputs, training.means.mT.contiguous(), weights)
         return observations, self._search(training.inputs, _LONGEST_MEAN)
 
-    def _fit_mean(self, training: TrainingSet, found: Found | None = None) -> tuple[LatentGP, FitReport]:
+    def _fit_mean(self, training: TrainingSet, job: Job, found: Found | None = None) -> tuple[LatentGP, FitReport]:
         """Processes by evidence, or through the means where rows that repeat inputs contradict these.
 
         The evidence sees the mean at each input, not how far the rows there differ: with few inputs, or jumps between
         them, it may take for noise what all demonstrations agree on. A process that would swing far beyond the means
         between the inputs to follow them is rejected with a warning.
         """
-        observations, search = job = self._mean_job(training)
+        observations, search = job
         found = fit_together([job])[0] if found is None else found
         mean, _ = condition(observations, found.hyperparameters, self.kernel, basis=found.basis)
         if int(training.counts.min()) < 2 or not training.repeats_inputs:
@@ -287,7 +287,7 @@ def _contradicted(
 
     All inputs together are tested by the F test of lack of fit, each single one by Student's t.
     """
-    counts, squares = training.counts, training.squares()
+    counts, squares = training.counts, training.squares
     degrees = counts - 1.0
     pooled = squares.sum(0) / degrees.sum()
     local = torch.maximum(squares / degrees[:, None], _LEAST_SPREAD**2 * pooled)

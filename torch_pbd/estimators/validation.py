@@ -226,7 +226,7 @@ def warn_if_few(
 def warn_if_identical(training: TrainingSet) -> None:
     """Warn of outputs that, up to rounding, never vary at repeated inputs, or anywhere if no input repeats."""
     repeated = len(training.y) - len(training.inputs)
-    squares = training.squares() if repeated else (training.y - training.y.mean(0)).square()
+    squares = training.squares if repeated else (training.y - training.y.mean(0)).square()
     if float(squares.sum(0).max()) < 1e-18 * max(1, repeated or len(training.y) - 1):
         checks.warn(
             "The demonstrations are identical: their covariance is zero, and the smallest that can be told "

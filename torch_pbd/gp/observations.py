@@ -68,7 +68,7 @@ def longest_within(inputs: Float[Tensor, "n e"]) -> float:
     In a hole among inputs on a line it is to be so too.
     """
     hole = float(inputs[:, 0].sort().values.diff().max()) if inputs.shape[1] == 1 else 0.0
-    return min(_LONGEST, hole / _IN_HOLE) if hole > max(_HOLE, _SPACINGS * spacing(inputs)) else _LONGEST
+    return min(_LONGEST, hole / _IN_HOLE) if hole > _HOLE and hole > _SPACINGS * spacing(inputs) else _LONGEST
 
 
 def neighbourhoods(inputs: Float[Tensor, "n e"], max_inputs: int) -> Int64[Tensor, " n"]:

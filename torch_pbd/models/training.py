@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int64
@@ -27,12 +28,12 @@ class TrainingSet:
     inputs: Float[Tensor, "n e"]
     index: Int64[Tensor, " rows"]
 
-    @property
+    @cached_property
     def counts(self) -> Float[Tensor, " n"]:
         """Rows at each distinct input."""
         return torch.bincount(self.index, minlength=len(self.inputs)).to(self.y)
 
-    @property
+    @cached_property
     def repeats_inputs(self) -> bool:
         """Whether rows are at the inputs themselves, which are no centres of neighbourhoods."""
         return torch.equal(self.inputs[self.index], self.x)
@@ -41,13 +42,15 @@ class TrainingSet:
         """Sum at each distinct input of what rows have."""
         return sum_by(values, self.index, len(self.inputs))
 
+    @cached_property
     def means(self) -> Float[Tensor, "n d"]:
         """Mean of y at each distinct input."""
         return self.sums(self.y) / self.counts[:, None]
 
+    @cached_property
     def squares(self) -> Float[Tensor, "n d"]:
         """Sum at each distinct input of the squares of y around its mean there."""
-        return self.sums((self.y - self.means()[self.index]).square())
+        return self.sums((self.y - self.means[self.index]).square())
 
     def merged(self, max_inputs: int) -> "TrainingSet":
         """Rows with at most ``max_inputs`` distinct inputs: neighbours are taken together."""
@@ -101,7 +104,7 @@ def pooled_tril(training: TrainingSet) -> Float[Tensor, "d d"]:
     Where no input repeats there is nothing to pool: then of the covariance of all of y.
     """
     degrees = len(training.y) - len(training.inputs)
-    residual = training.y - training.means()[training.index]
+    residual = training.y - training.means[training.index]
     if degrees < 1:
         residual, degrees = training.y - training.y.mean(0), max(1, len(training.y) - 1)
     return scale_tril_from_root(residual.mT) / degrees**0.5
@@ -133,7 +136,7 @@ def empirical_tril(training: TrainingSet, *, bias_correction: bool = False) -> F
     (Bartlett), ``sqrt(2 / (K - 1)) * gamma((K - i + 1) / 2) / gamma((K - i) / 2)``, i from 1.
     """
     n_outputs = training.y.shape[1]
-    root = training.scatter_root(training.y - training.means()[training.index])
+    root = training.scatter_root(training.y - training.means[training.index])
     degrees = training.counts - 1.0
     lacking = degrees < n_outputs
     prior_degrees = float(n_outputs + 1)

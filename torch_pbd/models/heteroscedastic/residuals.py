@@ -107,8 +107,8 @@ def _too_smooth(training: TrainingSet) -> Bool[Tensor, " d"]:
     A signal only adds to them.
     """
     order = training.inputs[:, 0].argsort()
-    counts, means = training.counts[:, None], training.means()
-    variance = (training.squares() / counts / (counts - 1.0).clamp_min(1.0))[order]
+    counts, means = training.counts[:, None], training.means
+    variance = (training.squares / counts / (counts - 1.0).clamp_min(1.0))[order]
     expected = (variance[:-3] + 9.0 * variance[1:-2] + 9.0 * variance[2:-1] + variance[3:]).mean(0)
     ratio = means[order].diff(n=3, dim=0).square().mean(0) / expected.clamp_min(_CONSTANT)
     half = torch.full_like(ratio, 0.5 * _SHARE_OF_THIRD * max(len(means) - 3, 0))

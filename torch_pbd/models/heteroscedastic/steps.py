@@ -56,7 +56,7 @@ def fit_mean(
     Hyperparameters are chosen for each output by its own evidence, as if its noise were independent of the others';
     the posterior is that of all outputs together.
     """
-    means, counts = rows.means(), rows.counts
+    means, counts = rows.means, rows.counts
     # One output: its mean over the deviation of its noise is features times weights, and noise of unit variance. In the
     # search alone no noise is less than _NONE. Rounding of kernels, 1e-16, changes the evidence of n inputs by about n
     # 1e-16 over the variance of the noise: of 1e-12 by .02 nats, and rounding of y then led to other length scales.
@@ -112,7 +112,7 @@ def mean_start(
     """
     training = rows.merged(MOST_INPUTS)
     rows_at_input = training.counts.mean()
-    observations = Observations(training.inputs, training.means().mT.contiguous(), training.counts / rows_at_input)
+    observations = Observations(training.inputs, training.means.mT.contiguous(), training.counts / rows_at_input)
     noise = pooled_tril(rows).norm(dim=1) / rows_at_input.sqrt()
     # Rows that repeat inputs show the noise, unless they are copies.
     known = noise if 2 * len(rows.inputs) <= len(rows.x) and bool((noise > _LEAST_NOISE).all()) else None
