@@ -16,6 +16,8 @@ from torch_pbd.movement.time_kernel import TimeKernel, smooth_correlation
 # Candidate length scales in ranges of the time, from the spacing of fifty steps to a movement that bends once, and
 # candidate nuggets shared by all steps.
 _LENGTHS = torch.logspace(math.log10(0.02), 0.0, 14, dtype=torch.float64).tolist()
+# Factors from the one before to the next of these: smooth laws are a third of their divergence farther without.
+_BETWEEN = [(_LENGTHS[1] / _LENGTHS[0]) ** (step / 6.0) for step in range(-6, 7)]
 _NUGGETS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1)
 _FINE_WEIGHTS = (0.03, 0.1, 0.3, 0.6)  # candidate shares of the tremor in the variance at a usual step
 _RATIOS = (2.0, 4.0)  # candidate ratios of the slow length scale to the tremor's
@@ -112,8 +114,7 @@ class _Output:
         found = self.search(self.usual_steps(), kernel)
         unit = self._candidates([found.scales], kernel)[0]
         nugget = self._step_nuggets(unit, _LEAST)
-        whole, groups = unit + torch.diag(nugget), _by_pattern(self.residual)
-        return Start(found, nugget, sum(float(_log_likelihood(whole[seen][None, :, seen], z)) for seen, z in groups))
+        return Start(found, nugget, float(_log_likelihood((unit + torch.diag(nugget))[None], self.residual)))
 
     def fit(self, kernel: str, start: Start, is_sum: bool) -> TimeKernel:
         """Scales and nuggets in alternation."""
@@ -130,6 +131,7 @@ class _Output:
                 break
             unit = self._candidates([found.scales], kernel)[0]
             nugget = self._step_nuggets(unit, min(found.nugget, 0.1 * _SMOOTH))
+        found, unit = self._refined(found, nugget, kernel)
         filled = self.residual.clone()
         for own in filled:  # the kernel's expectation where there were no samples
             seen = ~own.isnan()
@@ -162,16 +164,19 @@ class _Output:
     ) -> Found:
         """Highest log likelihood of ``(1 - eta) K + eta I`` at some steps, with its scales and shared nugget eta."""
         steps = steps if 2 * int(steps.sum()) >= len(steps) else torch.ones_like(steps)
-        groups = _by_pattern(_unit_rms(self.residual[:, steps]))
-        unit = self._candidates(candidates, kernel, steps)
-        values = []
-        for nugget in nuggets:
-            whole = (1.0 - nugget) * unit + nugget * torch.eye(unit.shape[1]).to(unit)
-            each = [_log_likelihood(whole[:, seen][:, :, seen], rows) for seen, rows in groups]
-            values.append(torch.stack(each).sum(0))
-        table = torch.stack(values)
+        rows, unit = _unit_rms(self.residual[:, steps]), self._candidates(candidates, kernel, steps)
+        eye = torch.eye(unit.shape[1]).to(unit)
+        table = torch.stack([_log_likelihood((1.0 - eta) * unit + eta * eye, rows) for eta in nuggets])
         best = int(table.argmax())
         return Found(float(table.max()), candidates[best % len(candidates)], nuggets[best // len(candidates)])
+
+    def _refined(self, found: Found, nugget: Float[Tensor, " T"], kernel: str) -> tuple[Found, Float[Tensor, "T T"]]:
+        """Likeliest scales around those found, of all steps with the nugget of each, and their correlation."""
+        slow, fast, weight = found.scales
+        candidates = [(factor * slow, factor * fast, weight) for factor in _BETWEEN]
+        unit = self._candidates(candidates, kernel)
+        best = int(_log_likelihood(unit + torch.diag(nugget), self.residual).argmax())
+        return found._replace(scales=candidates[best]), unit[best]
 
     def _parts(self, scales: Sequence[Scales]) -> tuple[Float[Tensor, "b 2"], Float[Tensor, "b T"]]:
         """Length scales, and variances of the tremor over those of the slow part."""
@@ -222,12 +227,15 @@ def smoothest_first(residual: Float[Tensor, "K T d"]) -> Int64[Tensor, " d"]:
     return ((bend / bend.min()).log() / math.log(_ROUGHER)).floor().argsort(stable=True)
 
 
-def _log_likelihood(covariance: Float[Tensor, "b n n"], rows: Float[Tensor, "n s"]) -> Float[Tensor, " b"]:
-    """Log density of the series in ``rows``, up to a constant; minus infinity where a matrix is singular."""
-    root, info = torch.linalg.cholesky_ex(covariance)
-    whitened = torch.linalg.solve_triangular(root, rows.expand(len(root), *rows.shape), upper=False)
-    value = -0.5 * whitened.square().sum((1, 2)) - rows.shape[1] * root.diagonal(dim1=1, dim2=2).log().sum(1)
-    return torch.where((info == 0) & torch.isfinite(value), value, -torch.inf)
+def _log_likelihood(covariance: Float[Tensor, "b n n"], residual: Float[Tensor, "K n"]) -> Float[Tensor, " b"]:
+    """Log density of series with holes, up to a constant; minus infinity where a matrix is singular."""
+    total = covariance.new_zeros(len(covariance))
+    for seen, rows in _by_pattern(residual):
+        root, info = torch.linalg.cholesky_ex(covariance[:, seen][:, :, seen])
+        whitened = torch.linalg.solve_triangular(root, rows.expand(len(root), *rows.shape), upper=False)
+        value = -0.5 * whitened.square().sum((1, 2)) - rows.shape[1] * root.diagonal(dim1=1, dim2=2).log().sum(1)
+        total += torch.where((info == 0) & torch.isfinite(value), value, -torch.inf)
+    return total
 
 
 def _left_out(kernel: TimeKernel, shares: Sequence[float]) -> tuple[float, float]:
