@@ -75,7 +75,6 @@ class RateLimit(StiffnessFilter):
         remedy = "a rate limit needs it, for a free axis has no equilibrium"
         checks.number(softest, "the smallest eigenvalue of stiffness", above=0.0, unit="N/m", remedy=remedy)
         return _ActiveRateLimit(alpha)
-        return _ActiveRateLimit(alpha)
 
 
 @final

@@ -245,7 +245,8 @@ class Planning(BaseEstimator):
                 raise ValueError(
                     f"the {name} of the schedule is {value:.4g} {_UNITS[name]}, must be at most limits.{name}, "
                     f"{most:g} {_UNITS[name]}: correct units ({units}) or time_unit ({self.time_unit_}) of the "
-                    f"recordings, or give limits=MotionLimits({name}=...) or None."
+                    "recordings, or a goal, start or via point that leaves too little time; or give "
+                    f"limits=MotionLimits({name}=...) or None."
                 )
 
 

@@ -24,6 +24,9 @@ _N_KNOTS = 200  # knots of a change over a movement, whose length scales are at 
 _FAR = 30.0
 _LIKELY = 0.95  # share of demonstrations beyond whose deviation a point counts as unlikely
 
+_Points = dict[str, tuple[float, Floats]]
+"""Movement times and outputs of points, NaN where free, by their names in errors."""
+
 
 def can_bend(controller: Any, *, must: bool = False) -> bool:
     """Whether the covariance is a model of whole movements of positions; if it must be, others are refused."""
@@ -91,9 +94,13 @@ def planned(
     if via is None and (not can_bend(controller) or (goal is None and start is None)):
         return controller, goal, start
     can_bend(controller, must=True)
-    points = _one_each_time(_checked_points(via, controller), controller)
-    rest, known, pins = {"goal": goal, "start": start}, [], []
-    for name, at, own in (("start", 0.0, controller.start_), ("goal", controller.duration_, controller.goal_)):
+    rest, known, pins = {"start": start, "goal": goal}, [], []
+    times_of_ends = {"start": 0.0, "goal": controller.duration_}
+    points = {n: (times_of_ends[n], place) for n, place in rest.items() if place is not None and place.ndim == 1}
+    points = _one_each_time(points | _checked_points(via, controller), controller)
+    points = {name: point for name, point in points.items() if name not in rest}
+    for name, own in (("start", controller.start_), ("goal", controller.goal_)):
+        at = times_of_ends[name]
         target = rest[name]
         if target is not None and target.ndim > 1:
             continue  # a goal that moves
@@ -109,9 +116,9 @@ def planned(
         CubicSpline(even, controller.reproduction_.plan(even, rest["goal"], rest["start"], 1.0)[0]) if points else None
     )
     beyond = []
-    for number, (at, position) in points.items():
+    for name, (at, position) in points.items():
         change = position - path(at)
-        share = _likely_share(controller, at, change, f"via[{number}]")
+        share = _likely_share(controller, at, change, name)
         known.append((at, share * change))
         beyond.append((at, (1.0 - share) * change))
     times, changes = np.array([at for at, _ in known]), [change for _, change in known]
@@ -152,11 +159,11 @@ def _rounding(controller: Any) -> float:
     return checks.ROUNDING * float(controller.duration_)
 
 
-def _checked_points(via: Any, controller: Any) -> list[tuple[float, Floats]]:
-    """Movement times and outputs of via points, NaN where free."""
+def _checked_points(via: Any, controller: Any) -> _Points:
+    """Via points."""
     if via is not None and not np.iterable(via):
         raise checks.refusal(via, "via", "a list of pairs, each a time in s and a position")
-    points = []
+    points = {}
     for number, point in enumerate(() if via is None else via):
         try:
             at, position = point
@@ -167,23 +174,23 @@ def _checked_points(via: Any, controller: Any) -> list[tuple[float, Floats]]:
         position = controller.outputs_.rows(position, name)
         if position.shape != (n_outputs,) or np.isinf(position).any() or np.isnan(position).all():
             raise checks.refusal(position.tolist(), name, f"{n_outputs} numbers, NaN where free")
-        points.append((at, position))
+        points[f"via[{number}]"] = at, position
     return points
 
 
-def _one_each_time(points: list[tuple[float, Floats]], controller: Any) -> dict[int, tuple[float, Floats]]:
-    """Via points by their numbers, those at one time as one, which is likely or not as a whole."""
-    joined: dict[int, tuple[float, Floats]] = {}
-    for number, (at, position) in enumerate(points):
-        first = next((i for i, (own, _) in joined.items() if abs(at - own) <= _rounding(controller)), number)
+def _one_each_time(points: _Points, controller: Any) -> _Points:
+    """Points, those at one time as one, which is likely or not as a whole."""
+    joined: _Points = {}
+    for name, (at, position) in points.items():
+        first = next((i for i, (own, _) in joined.items() if abs(at - own) <= _rounding(controller)), name)
         at, own = joined.get(first, (at, position))
         rounding = checks.ROUNDING * np.nanmax(np.abs(own))
         differs = np.abs(position - own) > rounding  # not where either is NaN
         if differs.any():
             output = int(differs.argmax())
             raise InvalidParameterError(
-                f"{controller.names_[output]} of via[{number}] is {position[output]:.10g}, must be {own[output]:.10g} "
-                f"as of via[{first}], which is at the same time, {at:g} s: leave one of them out."
+                f"{controller.names_[output]} of {name} is {position[output]:.10g}, must be {own[output]:.10g} as of "
+                f"{first}, which is at the same time, {at:g} s: leave one of them out."
             )
         joined[first] = at, np.where(np.isnan(own), position, own)
     return joined

@@ -19,7 +19,7 @@ from torch_pbd.estimators.validation import check_groups, checked_queries, check
 from torch_pbd.movement.joint import Conditioned, JointNormal
 
 _DECIMALS = 10  # decimals kept of a time over the range of the fit's times, so that 0.1 + 0.2 and 0.3 are equal
-_MOST_KEPT = 1024  # most times whose law is cached
+_MOST_KEPT = 2048  # most times whose law is cached: a chunk of predictions, and what is known beside it
 _MOST_ENTRIES = 4096  # most entries conditioned on one by one: a matrix of their number squared is factorized
 
 

@@ -223,8 +223,8 @@ class RealTimeAdmittance:
             channel, motion = self._channel, self._motion
             step = now - motion.last
             is_regular = motion.is_regular and 0.0 < step <= motion.max_step
-            if not is_regular and math.isnan(motion.last):
-                raise RuntimeError("tick before start: call start(now) with the time of the same clock first.")
+            if not is_regular:
+                motion.check_start(now)
             status = channel.take(force, step if is_regular else motion.step)
             motion.is_stopped |= channel.is_lost
             status |= motion.live(now, step, channel.push) if is_regular else motion.live_irregular(now, channel.push)

@@ -134,6 +134,15 @@ class Motion:
         self.step += _SMOOTHING * (step - self.step)
         return status
 
+    def check_start(self, now: float) -> None:
+        """Raise before the start, and where all of several ticks since then were longer than ``max_step``."""
+        if math.isnan(self.last):
+            raise RuntimeError("tick before start: call start(now) with the time of the same clock first.")
+        late, step = self._n_late + 1, now - self.last
+        if self._is_new and late >= _LATE_ON_END and self.max_step < step < math.inf:
+            must = f"longer than a tick: all {late} since start were longer, the last of {step:.4g} s"
+            raise checks.refusal(self.max_step, "max_step", must, "give some ticks, and times in s", unit="s")
+
     def live_irregular(self, now: float, push: Vector) -> int:
         """Advance as `live` by a tick that differs from the last one, or to an invalid time ``now``."""
         status = self._read(now)
@@ -160,12 +169,9 @@ class Motion:
         if self._n_bad and now < self.last + 0.5 * self.step:
             self._clock.shift(now - self.step - self.last)
             self.last = now - self.step
-        self._newest, self._n_bad, step = now, 0, now - self.last
-        if step > self.max_step:
+        self._newest, self._n_bad = now, 0
+        if now - self.last > self.max_step:
             self._n_late += 1
-            if self._is_new and self._n_late >= _LATE_ON_END:
-                must = f"longer than a tick: all {self._n_late} since start were longer, the last of {step:.4g} s"
-                raise checks.refusal(self.max_step, "max_step", must, "give some ticks, and times in s", unit="s")
             return TickStatus.LATE
         self.is_regular, self._is_new, self._n_late = True, False, 0
         return 0
