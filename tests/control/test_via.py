@@ -175,7 +175,7 @@ def test_points_at_one_time_are_one_point(controller):
 
 
 def test_a_via_point_at_a_given_end_is_that_end(controller):
-    goal = controller.goal_ + [0.01, 0.0]
+    goal = controller.goal_ + np.array([0.01, 0.0])
     at_end = controller.schedule(rate=100.0, goal=goal, via=[(2.0, [np.nan, goal[1]])])
     np.testing.assert_array_equal(at_end.position, controller.schedule(rate=100.0, goal=goal, via=[]).position)
     with pytest.raises(ValueError, match=r"of via\[0\] is .*, must be .* as of goal, which is at the same time, 2 s"):

@@ -94,14 +94,10 @@ def planned(
     if via is None and (not can_bend(controller) or (goal is None and start is None)):
         return controller, goal, start
     can_bend(controller, must=True)
+    ends = {"start": (0.0, start), "goal": (controller.duration_, goal)}
+    points = _checked_points(via, ends, controller)
     rest, known, pins = {"start": start, "goal": goal}, [], []
-    times_of_ends = {"start": 0.0, "goal": controller.duration_}
-    points = {n: (times_of_ends[n], place) for n, place in rest.items() if place is not None and place.ndim == 1}
-    points = _one_each_time(points | _checked_points(via, controller), controller)
-    points = {name: point for name, point in points.items() if name not in rest}
-    for name, own in (("start", controller.start_), ("goal", controller.goal_)):
-        at = times_of_ends[name]
-        target = rest[name]
+    for (name, (at, target)), own in zip(ends.items(), (controller.start_, controller.goal_), strict=True):
         if target is not None and target.ndim > 1:
             continue  # a goal that moves
         change = own - own if target is None else target - own
@@ -159,11 +155,11 @@ def _rounding(controller: Any) -> float:
     return checks.ROUNDING * float(controller.duration_)
 
 
-def _checked_points(via: Any, controller: Any) -> _Points:
-    """Via points."""
+def _checked_points(via: Any, ends: dict[str, tuple[float, Floats | None]], controller: Any) -> _Points:
+    """Via points, those at one time as one, but for those at given ends, which they must agree with."""
     if via is not None and not np.iterable(via):
         raise checks.refusal(via, "via", "a list of pairs, each a time in s and a position")
-    points = {}
+    points = {name: (at, end) for name, (at, end) in ends.items() if end is not None and end.ndim == 1}
     for number, point in enumerate(() if via is None else via):
         try:
             at, position = point
@@ -175,7 +171,8 @@ def _checked_points(via: Any, controller: Any) -> _Points:
         if position.shape != (n_outputs,) or np.isinf(position).any() or np.isnan(position).all():
             raise checks.refusal(position.tolist(), name, f"{n_outputs} numbers, NaN where free")
         points[f"via[{number}]"] = at, position
-    return points
+    joined = _one_each_time(points, controller)
+    return {name: point for name, point in joined.items() if name not in ends}
 
 
 def _one_each_time(points: _Points, controller: Any) -> _Points:
