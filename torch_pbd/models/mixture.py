@@ -87,16 +87,25 @@ class GaussianMixture(Core):
             mean = sum_k h_k mu_k|x,
             root @ root.mT = sum_k h_k (Sigma_k|x + (mu_k|x - mean)(mu_k|x - mean)^T).
         """
-        e, scale_tril, inputs = self.n_features, self.scale_tril, self.components(self.n_features)
-        whitened = inputs.whiten(x)
-        log_share = inputs.log_joint(whitened).log_softmax(0).mT
-        # Inputs come first, so the joint factor's lower blocks are what a Schur complement would give.
-        component_mean = (self.mean[:, e:, None] + scale_tril[:, e:, :e] @ whitened).permute(2, 1, 0)
-        mean = (component_mean @ log_share.exp().unsqueeze(-1)).squeeze(-1)
+        mean, component_mean, log_share = self._means(x)
         root_share = (0.5 * log_share).exp()  # the gradient of sqrt(h) is infinite at h = 0
         between = root_share.unsqueeze(1) * (component_mean - mean.unsqueeze(-1))
-        within = torch.einsum("nk,kij->nikj", root_share, scale_tril[:, e:, e:]).flatten(2)
-        return mean, torch.cat([within, between], dim=-1)
+        within = torch.einsum("nk,kij->nikj", root_share, self.scale_tril[:, self.n_features :, self.n_features :])
+        return mean, torch.cat([within.flatten(2), between], dim=-1)
+
+    def predict_mean(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d"]:
+        """Mean alone, equal to the bit."""
+        return self._means(x)[0]
+
+    def _means(self, x: Tensor) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d k"], Float[Tensor, "n k"]]:
+        """Means of y given x, of the mixture and of its components, and the logarithms of these' responsibilities."""
+        e, inputs = self.n_features, self.components(self.n_features)
+        whitened = inputs.whiten(x)
+        log_share = inputs.log_joint(whitened).log_softmax(0)
+        # Inputs come first, so the joint factor's lower blocks are what a Schur complement would give.
+        component_mean = self.mean[:, e:, None] + self.scale_tril[:, e:, :e] @ whitened
+        mean = (log_share.exp().unsqueeze(1) * component_mean).sum(0)
+        return mean.mT, component_mean.permute(2, 1, 0), log_share.mT
 
     def type1(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
         """Distance of each row of ``x`` from data, as 0 on all training inputs to 1 far away.
