@@ -22,7 +22,7 @@ from torch_pbd import (
     load_demonstrations,
 )
 from torch_pbd.kernels import correlation
-from torch_pbd.movement import time_kernel_fit
+from torch_pbd.movement import time_kernel_fit, trajectory
 from torch_pbd.movement.time_kernel_fit import fit_time_kernel, smoothest_first
 
 GRID = np.linspace(0.0, 1.0, 30)
@@ -57,10 +57,14 @@ def sample_series(kernel, length_scale, n_demos=8, seed=3):
     return root @ normal
 
 
-def found_kernel(residual, *kernels):
-    """Time kernel of residuals whose deviations are one."""
+def fitted_kernel(residual, *kernels):
+    """Time kernel of residuals whose deviations are one, and squares of the demonstrations left out in turn."""
     grid = torch.from_numpy(GRID)
     return fit_time_kernel(grid, residual, torch.ones_like(residual[0]), list(kernels), None)
+
+
+def found_kernel(residual, *kernels):
+    return fitted_kernel(residual, *kernels)[0]
 
 
 @pytest.mark.parametrize("shrinkage", ["auto", 0.5])
@@ -303,13 +307,13 @@ def test_a_tremor_is_of_one_size_in_the_units_of_the_outputs():
 
 
 @pytest.mark.parametrize("kernel", ["squared_exponential", "matern52"])
-def test_the_share_is_the_likeliest_of_demonstrations_left_out(kernel):
+def test_share_and_squares_are_those_of_demonstrations_left_out(kernel):
     # Dense: the law of z under the others, with the blocks of the diagonal brought to one.
     series = torch.cat([sample_series("matern52", 0.4, 4)[..., :1], sample_series("matern52", 0.2, 4)[..., 1:]], dim=2)
-    found = found_kernel(series, kernel)
+    found, square = fitted_kernel(series, kernel)
     along, residual = found.correlation(found.grid, found.grid).numpy(), found.residual.numpy()
     (n_demos, n, d), shares = residual.shape, np.array([1.0, 0.9, 0.75, 0.6, 0.45, 0.3, 0.2, 0.1, 0.05])
-    values = []
+    values, squares = [], []
     for share in shares:
         total = 0.0
         for own in range(n_demos):
@@ -318,9 +322,44 @@ def test_the_share_is_the_likeliest_of_demonstrations_left_out(kernel):
             blocks = [np.linalg.inv(np.linalg.cholesky(whole[i : i + d, i : i + d])) for i in range(0, n * d, d)]
             unit = block_diag(*blocks) @ whole @ block_diag(*blocks).T
             total += multivariate_normal(np.zeros(n * d), unit, allow_singular=True).logpdf(residual[own].ravel())
+            if share == found.share:
+                squares.append(residual[own].ravel() @ np.linalg.solve(unit, residual[own].ravel()))
         values.append(total)
     assert found.share == shares[np.argmax(values)]
     assert len(set(values)) == len(shares)
+    np.testing.assert_allclose(square, squares, rtol=1e-10)
+
+
+def test_degrees_of_freedom_are_the_likeliest_of_demonstrations():
+    rng = np.random.default_rng(0)
+    for true, most, few, many in ((5.0, 20.0, 3.5, 7.5), (1e9, 20.0, 20.0, 20.0), (5.0, 4.0, 4.0, 4.0)):
+        # Four demonstrations in ten have fewer steps than others.
+        rows = [
+            rng.standard_normal(20 if k % 10 < 4 else 40) * np.sqrt((true - 2) / rng.chisquare(true))
+            for k in range(200)
+        ]
+        square, size = (torch.tensor([each(row) for row in rows]) for each in (lambda row: row @ row, len))
+        found = trajectory.movement_df(square, size, most)
+        assert few <= found <= many
+
+        def value(df, rows=rows):
+            return sum(multivariate_t(np.zeros(len(z)), (df - 2) / df * np.eye(len(z)), df=df).logpdf(z) for z in rows)
+
+        assert value(found) >= max(value(min(most, 1.1 * found)), value(max(3.0, found / 1.1)))
+
+
+def test_large_demonstrations_widen_the_law_and_do_not_make_draws_of_all_rough(monkeypatch):
+    """One in five is four times as far from the others, and trembles: most of a mean square is theirs."""
+    demos = np.stack([sample_series("squared_exponential", 0.3, 30, seed)[..., 0].numpy() for seed in (1, 2)], axis=2)
+    demos[::5] = 4.0 * (demos[::5] + 0.05 * np.random.default_rng(0).standard_normal(demos[::5].shape))
+    X, y, groups = stacked(demos)
+    rough = []
+    for rounds in (2, 1):
+        monkeypatch.setattr(trajectory, "_ROUNDS", rounds)
+        model = TrajectoryRegressor(CholeskyCovRegressor()).fit(X, y, groups=groups)
+        assert model.df_ < 8.0
+        rough.append(np.median(np.square(np.diff(model.sample_demonstrations(X[:30], 500, 0), 2, axis=1)).mean((1, 2))))
+    assert rough[0] < 0.3 * rough[1]
 
 
 def test_the_module_is_differentiable_and_the_law_of_the_estimator(model):

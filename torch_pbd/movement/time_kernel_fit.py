@@ -47,6 +47,14 @@ class Found(NamedTuple):
     nugget: float
 
 
+class LeftOut(NamedTuple):
+    """Highest log likelihood of demonstrations left out in turn, its share, and their squared distances under it."""
+
+    log_likelihood: float
+    share: float
+    square: Float[Tensor, " K"]
+
+
 class Start(NamedTuple):
     """Likeliest length scale of an output's usual steps, and the nugget of each step that goes with it."""
 
@@ -62,12 +70,12 @@ def fit_time_kernel(
     deviation: Float[Tensor, "T d"],
     kernels: Sequence[str],
     share: float | None,
-) -> TimeKernel:
+) -> tuple[TimeKernel, Float[Tensor, " K"]]:
     """Time kernel of whitened residuals, NaN where a demonstration has no sample near, over times of range one.
 
     Each output's residuals, given those that are smoother, were divided by its ``deviation``. The likeliest of the
     ``kernels`` is taken, another where demonstrations left out in turn are clearly likelier, and for ``share`` None the
-    share under which they are likeliest.
+    share under which they are likeliest. The second is their squared distance each under the law of the others.
     """
     parts, tremor = map(_unit_rms, residual.unbind(2)), deviation.median(0).values / deviation
     outputs = [_Output(grid, *part) for part in zip(parts, tremor.mT, strict=True)]
@@ -77,14 +85,14 @@ def fit_time_kernel(
     other = max(kernels, key=lambda name: sum(start.log_likelihood for start in starts[name]))
     shares = _SHARES if share is None else (share,)
     whole = _fit_outputs(outputs, usual, starts[usual], shares)
-    left_out, best = _left_out(whole, shares)
+    left_out = _left_out(whole, shares)
     if other != usual:
         instead = _fit_outputs(outputs, other, starts[other], shares)
-        value, its_best = _left_out(instead, shares)
-        if value > left_out + _CLEARLY * len(residual):
-            whole, best = instead, its_best
-    whole.share.fill_(best)
-    return whole
+        its_own = _left_out(instead, shares)
+        if its_own.log_likelihood > left_out.log_likelihood + _CLEARLY * len(residual):
+            whole, left_out = instead, its_own
+    whole.share.fill_(left_out.share)
+    return whole, left_out.square
 
 
 def _fit_outputs(
@@ -95,7 +103,7 @@ def _fit_outputs(
     for output, start in zip(outputs, starts, strict=True):
         # A tremor that makes the residuals of one output likelier need not do so jointly with those of the others.
         results = [output.fit(kernel, start, is_sum) for is_sum in (False, True)]
-        fitted.append(max(results, key=lambda result: _left_out(result, shares)[0]))
+        fitted.append(max(results, key=lambda result: _left_out(result, shares).log_likelihood))
     stacked = {name: torch.cat([getattr(each, name) for each in fitted]) for name in ("scales", "fine", "nugget")}
     filled = torch.cat([each.residual for each in fitted], dim=2)
     return TimeKernel(kernel, grid=outputs[0].grid, **stacked, residual=filled, share=filled.new_ones(()))
@@ -238,8 +246,8 @@ def _log_likelihood(covariance: Float[Tensor, "b n n"], residual: Float[Tensor, 
     return total
 
 
-def _left_out(kernel: TimeKernel, shares: Sequence[float]) -> tuple[float, float]:
-    """Highest log likelihood of the demonstrations, each under the law of the others' residuals, and its share.
+def _left_out(kernel: TimeKernel, shares: Sequence[float]) -> LeftOut:
+    """Highest log likelihood of the demonstrations, each under the law of the others' residuals.
 
     In this law ``z = C^-1 y``, y has the covariance ``S = share R + (1 - share) / (K - 1) sum z z'`` over the
     others, and ``C_t = chol S_tt`` keeps the marginals: it bends the smooth part, at a cost where that has little
@@ -249,7 +257,7 @@ def _left_out(kernel: TimeKernel, shares: Sequence[float]) -> tuple[float, float
     """
     n_demos, n_steps, d = kernel.residual.shape
     if n_demos < 3:  # a single other demonstration has no covariance
-        return 0.0, shares[0]
+        return LeftOut(0.0, shares[0], kernel.residual.square().sum((1, 2)))
     root = safe_cholesky(kernel.correlation(kernel.grid, kernel.grid), name="the correlation along the movement")
     residual = kernel.residual
 
@@ -260,9 +268,9 @@ def _left_out(kernel: TimeKernel, shares: Sequence[float]) -> tuple[float, float
     gram, outer = symmetrize(whitened @ whitened.mT), residual[..., None] * residual[..., None, :]
     unit, others = torch.eye(d).to(gram), (outer.sum(0) - outer) / (n_demos - 1)
 
-    def left_out(share: float) -> float:
+    def left_out(share: float) -> LeftOut:
         if share == 1.0:
-            return -0.5 * float(gram.trace())
+            return LeftOut(-0.5 * float(gram.trace()), share, gram.diagonal())
         factor = torch.linalg.cholesky(share * unit + (1.0 - share) * others)
         inner = whiten((factor @ residual[..., None])[..., 0])
         ridge = share * (n_demos - 1) / (1.0 - share)
@@ -274,12 +282,13 @@ def _left_out(kernel: TimeKernel, shares: Sequence[float]) -> tuple[float, float
         square = (inner.square().sum(1) - explained) / share
         # log det of share (I + G / a) over the others
         log_det = n_steps * d * math.log(share) - (n_demos - 1) * math.log(ridge) + own.log() - torch.logdet(inverse)
-        return float((factor.diagonal(dim1=-2, dim2=-1).log().sum((1, 2)) - 0.5 * (square + log_det)).sum())
+        value = float((factor.diagonal(dim1=-2, dim2=-1).log().sum((1, 2)) - 0.5 * (square + log_det)).sum())
+        return LeftOut(value, share, square)
 
+    best = max(map(left_out, shares), key=lambda each: each.log_likelihood)
     # The same for all shares, but not for all kernels.
     unit_log_det = n_demos * float(root.diagonal(dim1=1, dim2=2).log().sum())
-    values = list(map(left_out, shares))
-    return max(values) - unit_log_det, shares[values.index(max(values))]
+    return best._replace(log_likelihood=best.log_likelihood - unit_log_det)
 
 
 def _by_pattern(residual: Float[Tensor, "K T"]) -> list[tuple[Tensor, Tensor]]:

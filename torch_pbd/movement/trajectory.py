@@ -29,6 +29,9 @@ _FEWEST_DF, _MOST_DF = 3.0, 200.0  # bounds of the joint law's df: its variance 
 # Ratio of a row's degrees of freedom to a movement's: only the few demonstrations show how unusual a whole one can be,
 # while a row is also seen in its neighbours. 1, 1.5, 2, 3 and 4 were tried on half of the recorded sets.
 _WHOLE = 2.0
+_N_DF = 40  # candidates between the most and the fewest
+_ROUNDS = 2  # fits of the time kernel: the second one weighs demonstrations whose sizes differ
+_EVEN = 30.0  # degrees of freedom from which sizes differ too little, by 13 %, to fit the kernel again
 
 
 class TrajectoryLaw(nn.Module):
@@ -79,6 +82,18 @@ def root_in_order(covariance: Float[Tensor, "n d d"], order: Int64[Tensor, " d"]
     return safe_cholesky(covariance[:, order][:, :, order], name="the covariance at a step")[:, order.argsort()]
 
 
+def movement_df(square: Float[Tensor, " K"], size: Int64[Tensor, " K"], most: float) -> float:
+    """Degrees of freedom, at most ``most``, under which left-out demonstrations of this square and size are likeliest.
+
+    The covariance is the same under all. The few whose marginals were learned from them too differ less in size than a
+    new one does, so that this can tell of fewer degrees of freedom than others do, not of more.
+    """
+    df = most * (_FEWEST_DF / most) ** torch.linspace(0.0, 1.0, _N_DF, dtype=torch.float64)[:, None]
+    value = torch.lgamma(0.5 * (df + size)) - torch.lgamma(0.5 * df) - 0.5 * size * (df - 2.0).log()
+    value = value - 0.5 * (df + size) * torch.log1p(square / (df - 2.0))
+    return float(df[value.sum(1).argmax()])
+
+
 @dataclass(eq=False, repr=False)
 class TrajectoryRegressor(TimedMovement):
     """Joint law of a whole demonstration: marginals of a covariance regressor and a correlation along the movement.
@@ -120,7 +135,8 @@ class TrajectoryRegressor(TimedMovement):
         Standard deviation of the independent part at each step of the fit's grid, relative to the smooth part's.
     shrinkage_ : float
     df_ : float
-        Degrees of freedom of the joint law: half the median of the regressor's, clipped to 3 to 200.
+        Degrees of freedom of the joint law, 3 to 200: half the median of the regressor's, or fewer where left-out
+        demonstrations are likelier so, as they differ in size.
     timing_ : {"none", "warp"}
     timing_gain_ : float
         Only with timing="auto": gain of "warp" in the log-likelihood of left-out demonstrations, in nats per step, at
@@ -185,11 +201,23 @@ class TrajectoryRegressor(TimedMovement):
         whitened = torch.linalg.solve(root, torch.from_numpy(residual).unsqueeze(-1)).squeeze(-1)
         kernels = ("matern52", "squared_exponential") if self.time_kernel == "auto" else (self.time_kernel,)
         share = None if self.shrinkage == "auto" else 1.0 - float(self.shrinkage)
-        scaled = torch.from_numpy((grid - low) / width)
-        found = fit_time_kernel(scaled, whitened, root[:, order].diagonal(dim1=1, dim2=2), kernels, share)
+        scaled, deviation = torch.from_numpy((grid - low) / width), root[:, order].diagonal(dim1=1, dim2=2)
+        degrees = np.median(self.regressor_.predict_df(grid[:, np.newaxis]))
+        most = float(np.clip(degrees / _WHOLE, _FEWEST_DF, _MOST_DF))
+        size, weight = (~whitened.isnan()).sum((1, 2)), whitened.new_ones(len(whitened))
+        for _ in range(_ROUNDS):
+            weighted = weight[:, None, None] * whitened
+            found, square = fit_time_kernel(scaled, weighted, deviation, kernels, share)
+            # The kernel is that of weighted residuals over their rms; these are the squares of the unweighted ones.
+            square = square * weighted.square().nanmean() / (weight.square() * whitened.square().nanmean())
+            # Wide tails would blur the phase of a movement of unknown timing.
+            self.df_ = movement_df(square, size, most) if self._timing is None else most
+            if self.df_ >= min(most, _EVEN):
+                break
+            # Expectation maximization of Student's t: each demonstration counts by the expected inverse square of its
+            # size, so that large and restless ones do not make draws of all too long and too rough.
+            weight = ((self.df_ + size) / (self.df_ - 2.0 + square)).sqrt()
         self._set_law(found, order)
-        degrees = self.regressor_.predict_df(grid[:, np.newaxis])
-        self.df_ = float(np.clip(np.median(degrees) / _WHOLE, _FEWEST_DF, _MOST_DF))
         self.time_kernel_ = found.kernel
 
     def _set_law(self, kernel: TimeKernel, order: Tensor) -> None:
