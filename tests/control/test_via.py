@@ -57,8 +57,8 @@ def test_the_stiffness_rises_where_a_point_must_be_met(controller):
 
 def test_outputs_of_a_via_point_may_be_free(controller):
     plain = controller.schedule(rate=100.0)
-    bent = controller.schedule(rate=100.0, via=[(1.0, [np.nan, 0.14]), (1.5, [np.nan, 0.06])])
-    assert bent.position[100, 1] == pytest.approx(0.14, abs=1e-4)
+    bent = controller.schedule(rate=100.0, via=[(1.0, [np.nan, 0.13]), (1.5, [np.nan, 0.06])])
+    assert bent.position[100, 1] == pytest.approx(0.13, abs=1e-4)
     assert bent.position[150, 1] == pytest.approx(0.06, abs=1e-4)
     assert np.abs(bent.position[:, 0] - plain.position[:, 0]).max() < 0.05
 
@@ -180,6 +180,37 @@ def test_a_via_point_at_a_given_end_is_that_end(controller):
     np.testing.assert_array_equal(at_end.position, controller.schedule(rate=100.0, goal=goal, via=[]).position)
     with pytest.raises(ValueError, match=r"of via\[0\] is .*, must be .* as of goal, which is at the same time, 2 s"):
         controller.schedule(rate=100.0, goal=goal, via=[(2.0, goal + 0.1)])
+
+
+def test_points_that_are_likely_each_and_not_together_are_told_and_throw_nothing(controller):
+    """Half a standard deviation to either side within 30 ms: a movement through both, as these vary, swings far out."""
+    plain, deviation = controller.schedule(rate=100.0), np.sqrt(controller.predict_cov([[1.0]])[0, 0, 0])
+    via = [
+        (1.0 + dt, plain.position[round(100 + 100 * dt)] + [sign * 0.5 * deviation, 0.0])
+        for dt, sign in ((0, 1), (0.03, -1))
+    ]
+    for point in via:
+        controller.schedule(rate=100.0, via=[point])
+    with pytest.warns(UserWarning, match=r"via\[1\], at 1.03 s, is .* standard deviations from the movement"):
+        bent = controller.schedule(rate=100.0, via=via, limits=None)
+    np.testing.assert_allclose(bent.position[[100, 103]], [position for _, position in via], rtol=0, atol=1e-6)
+    assert np.abs(bent.position - plain.position)[:, 0].max() < deviation  # as both likely: 4.7
+
+
+def test_what_a_controller_was_conditioned_on_stays_where_goal_and_start_are_others(controller):
+    where = controller.predict([[1.0]])[0] + [0.02, 0.01]
+    known = controller.condition([1.0], [where])
+    for ends in ({"goal": controller.goal_ + 0.2}, {"start": controller.start_ - 0.2}):
+        moved = known.schedule(rate=100.0, **ends)
+        np.testing.assert_allclose(moved.position[100], where, rtol=0, atol=1e-6)
+        at_ends = known.schedule(rate=100.0).position[[0, -1]]
+        expected = [ends.get("start", at_ends[0]), ends.get("goal", at_ends[1])]
+        np.testing.assert_allclose(moved.position[[0, -1]], expected, rtol=0, atol=1e-9)
+    with pytest.raises(ValueError, match=r"y0 of via\[0\] is .* as of what is known at 1 s, which is at the same time"):
+        known.schedule(rate=100.0, via=[(1.0, where + 0.1)])
+    about = controller.condition([2.0], [controller.goal_ + 0.01], noise_scale=0.01)
+    goal = controller.goal_ + 0.02
+    np.testing.assert_allclose(about.schedule(rate=100.0, goal=goal).position[-1], goal, rtol=0, atol=1e-9)
 
 
 def test_a_movement_that_was_pushed_goes_on_from_where_it_is(controller):

@@ -87,46 +87,77 @@ def planned(
 ) -> tuple[Any, Floats | None, Floats | None]:
     """Controller conditioned on a goal, a start and via points, and the goal and start left to its primitive.
 
-    A point that deviates by more than 95 % of demonstrations raises a warning and is passed all the same. What is
-    beyond these changes the given outputs alone, as :func:`_rest_to_rest` has it: a correlation that is hardly known,
-    times thousands of standard deviations, would move the others by metres.
+    A point that deviates by more than 95 % of demonstrations, of those that pass the points before it, raises a warning
+    and is passed all the same. What is beyond these changes the given outputs alone, as :func:`_rest_to_rest` has it: a
+    correlation that is hardly known, times thousands of standard deviations, would move the others by metres.
     """
     if via is None and (not can_bend(controller) or (goal is None and start is None)):
         return controller, goal, start
     can_bend(controller, must=True)
-    ends = {"start": (0.0, start), "goal": (controller.duration_, goal)}
-    points = _checked_points(via, ends, controller)
-    rest, known, pins = {"start": start, "goal": goal}, [], []
-    for (name, (at, target)), own in zip(ends.items(), (controller.start_, controller.goal_), strict=True):
+    duration, motion = controller.duration_, controller.reproduction_.motion
+    ends = {"start": (0.0, start), "goal": (duration, goal)}
+    known, points = _known_points(controller), _checked_points(via, ends, controller)
+    rest, changes, pins = {"start": start, "goal": goal}, {}, []
+    for (name, (at, target)), place in zip(ends.items(), motion(np.array([0.0, duration]))[0], strict=True):
         if target is not None and target.ndim > 1:
             continue  # a goal that moves
-        change = own - own if target is None else target - own
-        if not change.any():
-            pins.append(at)
-            continue
-        share = _likely_share(controller, at, change)
-        rest[name] = None if share == 1.0 else own + (1.0 - share) * change
-        known.append((at, share * change))
-    even = np.linspace(0.0, controller.duration_, 2 * controller.n_steps)
-    path = (
-        CubicSpline(even, controller.reproduction_.plan(even, rest["goal"], rest["start"], 1.0)[0]) if points else None
+        rest[name] = None
+        if target is None or np.allclose(target, place, rtol=checks.ROUNDING, atol=0.0):
+            given = [own for own, _ in [*known.values(), *points.values()]]
+            pins += [at] if (np.abs(np.array(given) - at) > _rounding(controller)).all() else []
+        else:
+            changes[name] = target - place
+    likely = _Likely(controller, pins)
+    for name, own in (("start", controller.start_), ("goal", controller.goal_)):
+        if name in changes and (left := likely.add(ends[name][0], changes[name])).any():
+            rest[name] = own + left
+    even, aim = np.linspace(0.0, duration, 2 * controller.n_steps), rest["goal"]
+    aim = aim if aim is None or aim.ndim == 1 else None  # of one that moves nobody knows the path
+    path = CubicSpline(even, controller.reproduction_.plan(even, aim, rest["start"], 1.0)[0])
+    # What was known stays, wherever the primitive takes the path.
+    beyond = [(at, position - path(at)) for at, position in known.values() if changes]
+    beyond += [(at, likely.add(at, position - path(at), name)) for name, (at, position) in points.items()]
+    bent = conditioned(
+        controller, np.array(likely.times), np.reshape(likely.changes, (-1, controller.n_outputs_)), pins=pins
     )
-    beyond = []
-    for name, (at, position) in points.items():
-        change = position - path(at)
-        share = _likely_share(controller, at, change, name)
-        known.append((at, share * change))
-        beyond.append((at, (1.0 - share) * change))
-    times, changes = np.array([at for at, _ in known]), [change for _, change in known]
-    # A controller that was conditioned may know its start or its end already.
-    phase, before = controller.reproduction_.phase, controller.covariance_._known.time
-    pins = [at for at in pins if not (np.abs(times - at) <= _rounding(controller)).any()]
-    pins = [at for at in pins if not np.isclose(phase(np.array([at]))[0, 0], before).any()]
-    bent = conditioned(controller, times, np.reshape(changes, (-1, controller.n_outputs_)), pins=pins)
-    likely = bent.reproduction_.bend
-    changes = likely(likely.x) + _rest_to_rest(controller, beyond, likely.x)
-    bent.reproduction_.bend = CubicSpline(likely.x, changes)
+    bend = bent.reproduction_.bend
+    bent.reproduction_.bend = CubicSpline(bend.x, bend(bend.x) + _rest_to_rest(controller, beyond, bend.x))
     return bent, rest["goal"], rest["start"]
+
+
+class _Likely:
+    """Changes that demonstrations make likely, of one point after another, each given those before it.
+
+    Two points may each be likely, and no movement pass both. At the movement times ``pins`` the path stays.
+    """
+
+    def __init__(self, controller: Any, pins: Sequence[float]) -> None:
+        self.times, self.changes = list[float](), list[Floats]()
+        self._controller, self._outputs = controller, controller.outputs_
+        self._model = self._before = controller.covariance_.observed_along(self._outputs.axes)
+        if pins:
+            stays = controller.reproduction_.phase(np.array(pins))
+            self._model = self._before.condition(stays, self._outputs.decode(self._before.predict(stays)))
+
+    def add(self, at: float, change: Floats, name: str = "") -> Floats:
+        """What of a change, NaN where free, is beyond 95 % of demonstrations; if a named point's is, it warns."""
+        inputs, given = self._controller.reproduction_.phase(np.array([at])), ~np.isnan(change)
+        before, now = (self._outputs.decode(model.predict(inputs))[0] for model in (self._before, self._model))
+        left, size = change - (now - before), int(given.sum())
+        covariance = self._outputs.covariance(self._model.predict_cov(inputs))[0][np.ix_(given, given)]
+        degrees = min(float(self._model.predict_df(inputs)[0]), 1e12)  # infinite ones are not for f
+        distance = float(left[given] @ np.linalg.solve(covariance, left[given])) ** 0.5  # Mahalanobis distance
+        limit = float(size * f.ppf(_LIKELY, size, degrees) * (degrees - 2.0) / degrees) ** 0.5
+        if name and distance > limit:
+            checks.warn(
+                f"{name}, at {at:g} s, is {distance:.3g} standard deviations from the movement, where "
+                f"{limit:.3g} hold {_LIKELY:.0%} of demonstrations: how people would pass there was not shown."
+            )
+        beyond = (1.0 - limit / max(distance, limit)) * left
+        self._model = self._model.condition(inputs, (before + change - beyond)[np.newaxis])
+        self.times.append(at)
+        self.changes.append(change - beyond)
+        return beyond
 
 
 def _rest_to_rest(controller: Any, beyond: list[tuple[float, Floats]], time: Floats) -> Floats:
@@ -156,10 +187,12 @@ def _rounding(controller: Any) -> float:
 
 
 def _checked_points(via: Any, ends: dict[str, tuple[float, Floats | None]], controller: Any) -> _Points:
-    """Via points, those at one time as one, but for those at given ends, which they must agree with."""
+    """Via points, those at one time as one, but for those at given ends or known, which they must agree with."""
     if via is not None and not np.iterable(via):
         raise checks.refusal(via, "via", "a list of pairs, each a time in s and a position")
-    points = {name: (at, end) for name, (at, end) in ends.items() if end is not None and end.ndim == 1}
+    fixed = _known_points(controller)
+    fixed |= {name: (at, end) for name, (at, end) in ends.items() if end is not None and end.ndim == 1}
+    points = dict(fixed)
     for number, point in enumerate(() if via is None else via):
         try:
             at, position = point
@@ -172,7 +205,17 @@ def _checked_points(via: Any, ends: dict[str, tuple[float, Floats | None]], cont
             raise checks.refusal(position.tolist(), name, f"{n_outputs} numbers, NaN where free")
         points[f"via[{number}]"] = at, position
     joined = _one_each_time(points, controller)
-    return {name: point for name, point in joined.items() if name not in ends}
+    return {name: point for name, point in joined.items() if name not in fixed}
+
+
+def _known_points(controller: Any) -> _Points:
+    """Points that a conditioned controller knows without noise: where it is there."""
+    known, reproduction = controller.covariance_._known, controller.reproduction_
+    times = reproduction.time_of(known.time)
+    rows = zip(times, known.exact.reshape(-1, controller.n_outputs_), reproduction.motion(times)[0], strict=True)
+    return {
+        f"what is known at {at:g} s": (at, np.where(exact, place, np.nan)) for at, exact, place in rows if exact.any()
+    }
 
 
 def _one_each_time(points: _Points, controller: Any) -> _Points:
@@ -191,19 +234,3 @@ def _one_each_time(points: _Points, controller: Any) -> _Points:
             )
         joined[first] = at, np.where(np.isnan(own), position, own)
     return joined
-
-
-def _likely_share(controller: Any, at: float, change: Floats, name: str = "") -> float:
-    """Share of a change of the given outputs within which 95 % of demonstrations lie; less warns, if it has a name."""
-    given = ~np.isnan(change)
-    inputs, size = controller.reproduction_.phase(np.array([at])), int(given.sum())
-    covariance = controller.outputs_.covariance(controller.covariance_.predict_cov(inputs))[0][np.ix_(given, given)]
-    degrees = min(float(controller.covariance_.predict_df(inputs)[0]), 1e12)  # infinite ones are not for f
-    distance = float(change[given] @ np.linalg.solve(covariance, change[given])) ** 0.5  # Mahalanobis distance
-    limit = float(size * f.ppf(_LIKELY, size, degrees) * (degrees - 2.0) / degrees) ** 0.5
-    if name and distance > limit:
-        checks.warn(
-            f"{name}, at {at:g} s, is {distance:.3g} standard deviations from the movement, where "
-            f"{limit:.3g} hold {_LIKELY:.0%} of demonstrations: how people would pass there was not shown."
-        )
-    return limit / max(distance, limit)
