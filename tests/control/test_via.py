@@ -194,7 +194,7 @@ def test_points_that_are_likely_each_and_not_together_are_told_and_throw_nothing
     with pytest.warns(UserWarning, match=r"via\[1\], at 1.03 s, is .* standard deviations from the movement"):
         bent = controller.schedule(rate=100.0, via=via, limits=None)
     np.testing.assert_allclose(bent.position[[100, 103]], [position for _, position in via], rtol=0, atol=1e-6)
-    assert np.abs(bent.position - plain.position)[:, 0].max() < deviation  # as both likely: 4.7
+    assert np.abs(bent.position - plain.position)[:, 0].max() < 2.0 * deviation  # taken for likely both, 4.7
 
 
 def test_what_a_controller_was_conditioned_on_stays_where_goal_and_start_are_others(controller):
