@@ -202,8 +202,12 @@ def test_millimetres_and_milliseconds_plan_and_move_as_metres_and_seconds(tunnel
 
 def test_outputs_in_different_units_are_told_of(tunnel):
     mixed = Demonstrations(tunnel.times, [position * [1e3, 1.0] for position in tunnel.positions], units=["mm", "m"])
-    with pytest.warns(UserWarning, match="in different units, mm, m: their principal axes mix them"):
-        DMPController(CD).fit(mixed)
+    with pytest.warns(
+        UserWarning, match=r"in different units, mm, m: their principal axes mix them.*\.in_units\('m'\)"
+    ):
+        controller = DMPController(CD).fit(mixed)
+    with pytest.raises(ValueError, match="distance"):  # limits of lengths apply
+        controller.schedule()
 
 
 def test_phases_need_a_duration(tunnel, controller):

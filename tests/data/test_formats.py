@@ -230,12 +230,16 @@ def test_mat_files_of_lasa_the_letters_and_ds_opt(tmp_path):
     with pytest.raises(DataFormatError, match="no times: give rate="):
         load_demonstrations(tmp_path / "letters.mat")
     assert load_demonstrations(tmp_path / "letters.mat", rate=RATE) == wanted(names)
-    kuka = [np.vstack([p.T, np.ones((3, len(p)))]) for p in PATHS]
-    long = [np.tile(k, 2) for k in kuka]  # more samples than rows
-    scipy.io.savemat(tmp_path / "kuka.mat", {"data": cells(long), "dt": 0.01})
+    even = [np.linspace(0.0, 1.0, 4 * n) for n in LENGTHS]  # more samples than rows
+    kuka = [
+        np.vstack([np.sin(6.0 * t + np.arange(3)[:, None]), 6.0 * np.cos(6.0 * t + np.arange(3)[:, None])])
+        for t in even
+    ]
+    scipy.io.savemat(tmp_path / "kuka.mat", {"data": cells(kuka), "dt": 0.01})
     loaded = load_demonstrations(tmp_path / "kuka.mat")
-    np.testing.assert_array_equal(loaded[10].position, np.tile(PATHS[10].T, 2).T)
-    np.testing.assert_array_equal(loaded[10].time, np.arange(2 * LENGTHS[10]) * 0.01)
+    assert loaded.names == tuple(names)
+    np.testing.assert_array_equal(loaded[10].position, kuka[10][:3].T)
+    np.testing.assert_array_equal(loaded[10].time, np.arange(4 * LENGTHS[10]) * 0.01)
     assert load_demonstrations(tmp_path / "kuka.mat", outputs="vel").names == ("vel_0", "vel_1", "vel_2")
     with pytest.raises(DataFormatError, match=r"no variable 'runs', but \[data, dt\]: say by variable="):
         load_demonstrations(tmp_path / "kuka.mat", variable="runs")
@@ -243,6 +247,34 @@ def test_mat_files_of_lasa_the_letters_and_ds_opt(tmp_path):
     scipy.io.savemat(tmp_path / "own.mat", one)
     with pytest.raises(DataFormatError, match="no variables demos or data"):
         load_demonstrations(tmp_path / "own.mat")
+
+
+@pytest.mark.parametrize("variable", ["joints", "demos", "data"])
+@pytest.mark.parametrize("n", [4, 6, 7])
+def test_no_row_of_a_mat_file_is_taken_for_a_velocity(tmp_path, rng, variable, n):
+    joints = [rng.normal(size=(n, 50)).cumsum(1) for _ in range(3)]
+    joints[1] = joints[1].T  # (T, d)
+    scipy.io.savemat(tmp_path / "joints.mat", {variable: cells(joints), "dt": 0.01})
+    loaded = load_demonstrations(tmp_path / "joints.mat", variable=variable, units="rad")
+    assert loaded.names == tuple(f"pos_{i}" for i in range(n))
+    for read, joint in zip(loaded.positions, [joints[0], joints[1].T, joints[2]], strict=True):
+        np.testing.assert_array_equal(read, joint.T)
+
+
+def test_velocities_stay_outputs_in_variables_of_other_names(tmp_path):
+    t = np.linspace(0.0, 1.0, 50)
+    scipy.io.savemat(tmp_path / "runs.mat", {"runs": np.stack([np.sin(t), np.cos(t)]), "dt": 0.02})
+    assert load_demonstrations(tmp_path / "runs.mat", variable="runs").n_outputs == 2
+
+
+def test_arrays_of_other_widths_or_none_are_told(tmp_path):
+    scipy.io.savemat(tmp_path / "set.mat", {"demos": cells([np.ones((3, 9)), np.ones((2, 9))]), "dt": 0.1})
+    with pytest.raises(DataFormatError, match=r"set\.mat: array 'pos' of demonstration 1 has 2 columns, must have 3"):
+        load_demonstrations(tmp_path / "set.mat")
+    structs = [{"pos": np.ones((3, 9)), "t": np.arange(9.0)}, {"pos": np.ones((3, 9))}]
+    scipy.io.savemat(tmp_path / "set.mat", {"demos": cells(structs)})
+    with pytest.raises(DataFormatError, match="array 't' of demonstration 1 has 0 columns, must have 1"):
+        load_demonstrations(tmp_path / "set.mat")
 
 
 def test_mat_files_of_version_7_3(tmp_path):
@@ -273,6 +305,13 @@ def test_arrays_of_laboratories(tmp_path):
     np.savez(tmp_path / "one.npz", t=TIMES[0], ee=PATHS[0], grip=np.ones(5))
     one = load_demonstrations(tmp_path / "one.npz")
     assert one.names == ("ee_0", "ee_1", "ee_2", "grip")
+    for names in ("time x y", "t x y", "t px py"):
+        np.savez(tmp_path / "columns.npz", **dict(zip(names.split(), np.c_[TIMES[0], PATHS[0][:, :2]].T, strict=True)))
+        columns = load_demonstrations(tmp_path / "columns.npz")
+        assert columns == Demonstrations(TIMES[0], [PATHS[0][:, :2]], names=names.split()[1:])
+    np.savez(tmp_path / "uneven.npz", t_0=[0, 1], x_0=np.ones((2, 2)), t_1=[0, 1], x_1=np.ones((2, 1)))
+    with pytest.raises(DataFormatError, match=r"uneven\.npz: array 'x' of demonstration 1 has 1 columns, must have 2"):
+        load_demonstrations(tmp_path / "uneven.npz")
     np.savez(tmp_path / "odd.npz", a=np.ones((4, 3)), b=np.ones((5, 2)))
     with pytest.raises(DataFormatError, match=r"fit no layout.*a \(4, 3\), b \(5, 2\)"):
         load_demonstrations(tmp_path / "odd.npz", rate=1)

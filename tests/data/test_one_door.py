@@ -45,11 +45,28 @@ def lines(*stamps, rows=X, sep=","):
             {},
         ),
         ("time,x,y\n" + lines("23:59:59.5", "23:59:60", "23:59:60.5"), {}),
-        ("time,x,y\n" + lines("0:00", "0:01", "0:02"), {"time_unit": "min"}),
+        ("time,x,y\n" + lines("0:00:00", "0:01:00", "0:02:00"), {"time_unit": "min"}),
+        # Clocks are set back between the second and the third.
+        ("time,x,y\n" + lines("2026-10-25T02:59:59+02:00", "2026-10-25 02:59:59.5+0200", "2026-10-25T02:00+01"), {}),
+        ("time,x,y\n" + lines("2026-01-01 05:29:59+05:30", "2025-12-31 20:29:59.5-03:30", "2026-01-01T00:00Z"), {}),
         ("time,frame_id,x,y\n0,world,1,2\n0.5,world,3,4\n1,world,5,7\n", {"outputs": ["x", "y"]}),
         ("time,x,y\n" + lines(*(1_700_000_000_000_000_001 + 500_000_000 * k for k in range(3))), {"time_unit": "ns"}),
     ],
-    ids=["one", "comments", "savetxt", "ms", "rate", "rate-time", "iso", "clock", "minutes", "text", "ns"],
+    ids=[
+        "one",
+        "comments",
+        "savetxt",
+        "ms",
+        "rate",
+        "rate-time",
+        "iso",
+        "clock",
+        "minutes",
+        "zones",
+        "half-hours",
+        "text",
+        "ns",
+    ],
 )
 def test_tables_as_people_have_them(tmp_path, text, options):
     loaded = load_text(tmp_path, text, **options)
@@ -58,6 +75,35 @@ def test_tables_as_people_have_them(tmp_path, text, options):
     np.testing.assert_array_equal(loaded.positions[0], X)
     assert loaded.names == ("x", "y")
     assert loaded.time_unit == options.get("time_unit", "s")
+
+
+@pytest.mark.parametrize("stamps", [("00:01", "00:02", "00:03"), ("0:00.5", "0:01.0", "0:01.5")])
+def test_clock_text_of_two_parts_is_hours_or_minutes(tmp_path, stamps):
+    with pytest.raises(DataFormatError, match=rf"column 'time': '{stamps[0]}' is hh:mm or mm:ss.*write 00: before"):
+        load_text(tmp_path, "time,x,y\n" + lines(*stamps))
+    loaded = load_text(tmp_path, "time,x,y\n" + lines(*(f"00:{stamp}" for stamp in stamps)))
+    assert loaded.times[0][-1] == {"00:03": 2.0, "0:01.5": 1.0}[stamps[-1]]
+
+
+@pytest.mark.parametrize("kind", ["dates", "ns", "float"])
+def test_times_of_several_files_count_from_the_first_of_all(tmp_path, kind):
+    for k in (0, 1):  # the second is a minute earlier
+        minute, seconds = 1 - k, range(3)
+        stamps = {
+            "dates": [f"2026-01-01T10:0{minute}:0{i}" for i in seconds],
+            "ns": [(1_700_000_000 + 60 * minute + i) * 10**9 + 123 for i in seconds],
+            "float": [60.0 * minute + i for i in seconds],
+        }[kind]
+        (tmp_path / f"{k}.csv").write_text("time,x,y\n" + lines(*stamps))
+    unit = {"time_unit": "ns"} if kind == "ns" else {}
+    loaded = load_demonstrations(tmp_path / "*.csv", **unit)
+    second = 1e9 if kind == "ns" else 1.0
+    assert [[*(time / second)] for time in loaded.times] == [[60.0, 61.0, 62.0], [0.0, 1.0, 2.0]]
+    assert load_demonstrations(tmp_path / "*.csv", from_start=True, **unit).is_aligned
+    bad = stamps[:1] + stamps[:1] + stamps[2:]
+    (tmp_path / "1.csv").write_text("time,x,y\n" + lines(*bad))
+    with pytest.raises(DataFormatError, match=r"1\.csv: times\[0\] must increase strictly"):
+        load_demonstrations(tmp_path / "*.csv", **unit)
 
 
 @pytest.mark.parametrize("cell", ["NA", "None", "null", "", "NaN"])
@@ -75,6 +121,10 @@ def test_a_column_that_numbers_the_demonstrations_is_found_out(tmp_path):
     with pytest.raises(DataFormatError, match=r"column 'trial': it numbers demonstrations.*demo='trial'"):
         load_text(tmp_path, text)
     assert load_text(tmp_path, text, demo="trial").n_steps == (20, 20, 20)
+    counted = "time,x\n" + "".join(f"{t},{i}\n" for i, t in enumerate(stamps))
+    with pytest.raises(DataFormatError, match=r"it counts rows, and is no movement.*say outputs=\['x'\]"):
+        load_text(tmp_path, counted)
+    assert load_text(tmp_path, counted, outputs=["x"]).names == ("x",)
     gripper = "time,x,gripper\n" + "".join(f"{t},{np.sin(t)},{int(t > 3)}\n" for t in stamps)
     assert load_text(tmp_path, gripper).names == ("x", "gripper")
     again = text.replace("trial,", "trial,", 1).splitlines()
@@ -149,6 +199,19 @@ def test_frames_have_the_guards_of_files():
         Demonstrations.from_frame(table, unit="m")
 
 
+def test_columns_and_times_that_are_no_names_and_numbers_are_told():
+    table = pd.DataFrame({"time": [0.0, 1.0], "x": [1.0, 3.0]})
+    for names in ([("a", "time"), ("a", "x")], [0, 1]):
+        with pytest.raises(ValueError, match=r"table\.columns is \[.*\], must be texts: join levels"):
+            Demonstrations.from_frame(table.set_axis(pd.Index(names), axis=1))
+    clock = pl.DataFrame({"time": [0, 10**9], "x": [1.0, 3.0]}).with_columns(pl.col("time").cast(pl.Time))
+    with pytest.raises(ValueError, match=r"time is datetime\.time\(0, 0\), must be a datetime64 or a number"):
+        Demonstrations.from_frame(clock)
+    dates = pd.DataFrame({"time": pd.to_datetime(["2026-01-01", None, "2026-01-02"]), "x": [1.0, 2.0, 4.0]})
+    with pytest.warns(MissingDataWarning, match="1 of 3"):
+        assert Demonstrations.from_frame(dates, missing="drop", time_unit="h").times[0].tolist() == [0.0, 24.0]
+
+
 def test_frames_of_polars_have_types_of_their_own():
     stamps = [datetime(2026, 1, 1, tzinfo=UTC) + timedelta(milliseconds=20 * i) for i in range(3)]
     table = pl.DataFrame({"demo": ["a"] * 3 + ["b"] * 3, "time": stamps * 2, "x": [1, None, 3, 4, 5, 6]})
@@ -186,6 +249,8 @@ def test_units_are_converted_by_their_kind():
     assert metres.positions[0].tolist() == [[0.001, 90], [0.002, 180], [1.5, 0]]
     np.testing.assert_allclose(mocap.in_units("rad").positions[0][:, 1], [np.pi / 2, np.pi, 0], rtol=1e-15)
     assert metres.in_units("mm", "ms") == mocap
+    assert mocap.in_units(["m", "s"]) == metres
+    assert mocap.in_units(["m", "rad"], "s") == metres.in_units("rad")
     with pytest.raises(ValueError, match=r"unit is 'm', must be of the kind of one of the outputs.*give units="):
         PLAIN.in_units("m")
     with pytest.raises(ValueError, match="time_unit is 's', must be one of h, min"):

@@ -59,7 +59,7 @@ def _warn_of_units(outputs: Outputs) -> None:
     elif outputs.unit is None:
         checks.warn(
             f"The outputs are in different units, {', '.join(outputs.units)}: their principal axes mix them, and "
-            "nothing is converted to m. Bring them to one unit, or control them apart."
+            "nothing is converted to m. Bring lengths, or angles, to one unit by .in_units('m'), or control them apart."
         )
     elif outputs.unit not in LENGTHS | ANGLES:
         checks.warn(

@@ -180,7 +180,7 @@ class Planning(BaseEstimator):
         check_is_fitted(self)
         speed = checks.number(speed, "speed", above=0.0)
         checks.instance(limits, "limits", MotionLimits, optional=True)
-        outputs, bounds = self.outputs_, limits if self.outputs_.in_metres else None
+        outputs, bounds = self.outputs_, limits if {*(self.outputs_.units or ())} <= {*LENGTHS} else None
         self._refuse_beyond(bounds, duration=self.duration_ / speed)
         time = tick_times(self.duration_ / speed, rate, self.n_outputs_, settle=settle)
         goal, start = self._place(goal, "goal", len(time) if via is None else 0), self._place(start, "start")

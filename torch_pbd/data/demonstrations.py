@@ -252,10 +252,13 @@ class Demonstrations(Editing):
         if not isinstance(rows, narwhals.DataFrame):
             must = "a dataframe of pandas, polars, pyarrow or alike, with its rows"
             raise checks.refusal(table, "table", must, "collect() lazy ones")
+        if not all(isinstance(name, str) for name in rows.columns):
+            raise checks.refusal(rows.columns, "table.columns", "texts", "join levels, ['_'.join(c) for c in columns]")
         wanted = Wanted(**options)
         chosen = wanted.choose({name: (name,) for name in rows.columns}, demo="demo", time="time")
         signals = {name: rows.get_column(name).to_numpy() for name in chosen.signals}
-        return wanted.finish([cls(**wanted.read_rows(chosen, signals))])
+        [content] = wanted.since_first([wanted.read_rows(chosen, signals)])
+        return wanted.finish([cls(**content)])
 
     def to_frame(self, library: Any = "pandas") -> Any:
         """Table of one row per sample with columns demo, time and the outputs; rotations are quaternions qw to qz.

@@ -101,15 +101,18 @@ class Editing:
         positions = unwrapped(self.times, self.positions, self.names, self.units, angles)
         return self._replace(self.times, positions, anew=True)
 
-    def in_units(self, unit: str | None = None, time_unit: str | None = None) -> Self:
+    def in_units(self, unit: str | Sequence[str] | None = None, time_unit: str | None = None) -> Self:
         """Demonstrations in another unit of length or angle, and of time: h, min, s, ms, us or ns.
 
-        The outputs of the kind of ``unit`` are converted; others, and rotations, stay as they are.
+        The outputs of the kind of ``unit`` are converted; others, and rotations, stay as they are. Several units, as
+        ``["mm", "deg", "ms"]``, may have that of time among them.
         """
         times, positions, units = self.times, self.positions, self.units
-        if unit is not None:
+        wanted = () if unit is None else as_texts(unit, "unit")
+        time_unit = next((one for one in wanted if one in TIMES), None) if time_unit is None else time_unit
+        for unit in (one for one in wanted if one not in TIMES):
             check_unit(unit, "unit", LENGTHS | ANGLES)
-            before, kind = self.units or (), LENGTHS if unit in LENGTHS else ANGLES
+            before, kind = units or (), LENGTHS if unit in LENGTHS else ANGLES
             n_free = len(self.names) - 3 * (self.rotation_reference is not None)  # a rotation is in rad
             units = tuple(unit if i < n_free and own in kind else own for i, own in enumerate(before))
             if unit not in units[:n_free]:

@@ -3,7 +3,7 @@
 import inspect
 import os
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
@@ -85,7 +85,7 @@ def load_demonstrations(
         Sampling rate in Hz of evenly spaced samples, which replaces the times in the file.
     rotation, angles, units, time_unit, frame, missing
         Parameters of `Demonstrations`; None takes those in the file, if any. Dates and times of day become seconds
-        since the first of all. Quaternions of ROS and robosuite are stored x y z w; ``rotation`` names them w x y z.
+        since the first of all files. Quaternions of ROS and robosuite are stored x y z w; ``rotation`` names w x y z.
     in_units : str or sequence of str, default=None
         Units to convert to, as by `Demonstrations.in_units`: "m", or ["m", "s"] with that of the times. ``units`` and
         ``time_unit`` describe the numbers in the file without converting them.
@@ -147,10 +147,13 @@ def find_files(source: Source) -> list[Path]:
 
 
 def _load(source: Source, wanted: Wanted, options: dict[str, Any]) -> Demonstrations:
-    return wanted.finish([_load_file(file, wanted, options) for file in find_files(source)])
+    files = [_load_file(file, wanted, options) for file in find_files(source)]
+    contents = wanted.since_first([next(file) for file in files])
+    return wanted.finish([file.send(content) for file, content in zip(files, contents, strict=True)])
 
 
-def _load_file(file: Path, wanted: Wanted, options: dict[str, Any]) -> Demonstrations:
+def _load_file(file: Path, wanted: Wanted, options: dict[str, Any]) -> Generator[Any, Any, None]:
+    """Content of a file, and then, sent back with times that count from the first of all files, its demonstrations."""
     reader = _function(file, _reader_of(file), _FORMATS)
     own = list(inspect.signature(reader).parameters)[2:]
     check_options(options, [*OPTIONS, *own], f"{file.suffix or file.name} files")
@@ -161,7 +164,8 @@ def _load_file(file: Path, wanted: Wanted, options: dict[str, Any]) -> Demonstra
         if file.is_file() and n_bytes > wanted.max_bytes:
             raise ValueError(f"it has {n_bytes} bytes, more than max_bytes={wanted.max_bytes}: raise it to read this.")
         require_memory(_COPIES * n_bytes, what="reading it", remedy="Split the file, or leave samples out.")
-        return Demonstrations(**reader(file, wanted, **options))
+        content = yield reader(file, wanted, **options)
+        yield Demonstrations(**content)
     except ModuleNotFoundError:
         raise
     except Exception as error:  # parsers of bytes that are not what they claim to be raise errors of all kinds

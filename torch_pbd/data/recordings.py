@@ -55,7 +55,7 @@ def as_recordings(times: Any, positions: Any, missing: str) -> tuple[tuple[Float
         kept = _not_missing(grids, samples)
         grids = [grid[numbers] for grid, numbers in zip(grids, kept, strict=True)]
         samples = [sample[numbers] for sample, numbers in zip(samples, kept, strict=True)]
-    return tuple(map(_rising, _from_common_origin(grids), grids, names, kept)), tuple(map(frozen, samples))
+    return tuple(map(_rising, from_common_origin(grids), grids, names, kept)), tuple(map(frozen, samples))
 
 
 def as_texts(values: Any, name: str, n_outputs: int | None = None) -> tuple[str, ...]:
@@ -166,14 +166,14 @@ def _not_missing(grids: Arrays, samples: Arrays) -> list[NDArray[np.intp]]:
     return [np.flatnonzero(~hole) for hole in holes]
 
 
-def _from_common_origin(grids: Arrays) -> Arrays:
+def from_common_origin(grids: Arrays) -> Arrays:
     """Times; integers too large for float64 are counted from the first one, so that steps stay exact."""
     beyond = [grid for grid in grids if grid.dtype.kind in "iu" and max(grid.max(), -int(grid.min())) > 2**53]
     if not beyond:
         return grids
     origin = min(int(grid.min()) for grid in beyond)
     # As Python's integers, whose differences, over all of int64 or of uint64, do not overflow.
-    return [(grid.astype(object) if grid.dtype.kind in "iu" else grid) - origin for grid in grids]
+    return [np.float64(grid.astype(object) - origin) if grid.dtype.kind in "iu" else grid - origin for grid in grids]
 
 
 def _rising(grid: NDArray[Any], original: NDArray[Any], name: str, numbers: NDArray[np.intp]) -> Floats:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.data.recordings import Missing, as_texts, locked, preview
+from torch_pbd.data.recordings import Missing, as_texts, from_common_origin, locked, preview
 from torch_pbd.data.units import TIMES
 from torch_pbd.files.memory import require_memory
 
@@ -109,8 +109,8 @@ class Wanted:
         if absent:
             remedy = "name the columns by demo=, time= (or rate=, in Hz, where there are none) and outputs="
             raise ValueError(f"no column {absent[0]} among {preview([*places])}: {remedy}.")
-        own_time = None if self.rate is not None else places.get(time)
-        return Chosen(places.get(demo), own_time, [places[name] for name in names], names)
+        time = None if self.rate is not None else time
+        return Chosen(places.get(demo), places.get(time), [places[name] for name in names], names)
 
     def refuse(self, message: str, option: str) -> None:
         """Raise ValueError, or note the message where notes are taken and the caller knows a way around."""
@@ -131,21 +131,29 @@ class Wanted:
         heads = np.flatnonzero(np.r_[True, demo[1:] != demo[:-1]][:n_rows])
         blank = [row for row in heads if demo[row] is None or demo[row] != demo[row]]
         if chosen.demo and blank:
-            what = f"column {chosen.demo[0]!r} is blank in row {blank[0]}"
-            raise ValueError(f"{what}: it tells the demonstrations apart.")
+            raise ValueError(
+                f"column {chosen.demo[0]!r} is blank in row {blank[0]}: it tells the demonstrations apart."
+            )
         each = ({name: values[own] for name, values in signals.items()} for own in _rows_of(demo, heads))
         return self.read_each(chosen, each, **labels)
 
     def read_each(self, chosen: Chosen, recordings: Iterable[Mapping[str, NDArray[Any]]], **labels: Any) -> Arguments:
         """Arguments of ``Demonstrations`` from the signals of each recording; ``labels`` are those in the file."""
-        times, positions = [], []
-        for signals in recordings:
+        times, positions, widths = [], [], dict[str, int]()
+        for k, signals in enumerate(recordings):
+            for name in chosen.signals:
+                n = (*signals[name].shape, 1)[1] if name in signals else 0
+                if n != widths.setdefault(name, n):
+                    must = f"must have {widths[name]} as that of the first: select others by outputs=, or mend the file"
+                    raise ValueError(f"array {name!r} of demonstration {k} has {n} columns, {must}.")
             columns = [_column(signals, place) for place in chosen.outputs]
             for name, values in zip(chosen.names, columns, strict=True):
                 if values.dtype.kind not in "biuf":
                     raise ValueError(f"column {name!r} holds {values.dtype}, no numbers: leave it out by outputs=.")
             positions.append(locked(np.stack(columns, axis=1, dtype=np.float64)))  # which need not be copied
             times.append(_column(signals, chosen.time) if chosen.time else np.arange(len(columns[0])))
+            if hasattr(stamp := next(iter(times[-1]), None), "isoformat"):  # one of Python's
+                raise checks.refusal(stamp, "time", "a datetime64 or a number", "convert the column")
         given = {name: getattr(self, name) for name in ("units", "frame", "rotation", "angles", "time_unit")}
         known = {name: value for name, value in (*labels.items(), *given.items()) if value is not None}
         labels = {"names": chosen.names, "time_unit": "s", **known}
@@ -156,17 +164,23 @@ class Wanted:
         elif chosen.time is None:
             self.refuse("it holds no times: give rate=, the samples a second (robosuite records 20).", "rate")
             labels["time_unit"] = "samples"
-        elif times and all(time.dtype.kind in "mM" for time in times):
-            # Counted from the first of all, in which they are exact where dates would not be.
-            unit = checks.choice(labels["time_unit"], "time_unit", TIMES).replace("min", "m")  # as NumPy has it
-            origin, step = min(time.min() for time in times), np.array(1, dtype=f"m8[{unit}]")
-            times = [(time - origin).astype("m8[ns]") / step for time in times]
         return {"times": times, "positions": positions, "missing": self.missing, **labels}
+
+    def since_first(self, parts: Sequence[Arguments]) -> list[Arguments]:
+        """Arguments with dates, and whole numbers beyond 2**53, counted from the first of all, which is exact."""
+        grids: list[Any] = [time for part in parts for time in part["times"]]
+        kinds = {time.dtype.kind for time in grids}
+        if kinds and kinds <= {"m", "M"}:
+            unit = checks.choice(self.time_unit or "s", "time_unit", TIMES).replace("min", "m")  # as NumPy has it
+            origin, step = np.fmin.reduce([np.fmin.reduce(time) for time in grids]), np.array(1, dtype=f"m8[{unit}]")
+            grids = [(time - origin).astype("m8[ns]") / step for time in grids]
+        elif kinds <= {"i", "u"} and len(parts) > 1:  # of one, errors tell the stamps
+            grids = from_common_origin(grids)
+        return [part | {"times": [grids.pop(0) for _ in part["times"]]} for part in parts]
 
     def finish(self, parts: Sequence[_Recorded]) -> _Recorded:
         """Demonstrations of all files as one set, converted, cut and trimmed."""
-        for unit in self.in_units or ():
-            parts = [part.in_units(**{"time_unit" if unit in TIMES else "unit": unit}) for part in parts]
+        parts = [part.in_units(self.in_units) for part in parts] if self.in_units else parts
         whole = parts[0] if len(parts) == 1 else type(parts[0]).concatenate(parts)
         if len(parts) > 1 and self.angles is not None:
             whole = whole.unwrap(self.angles)
@@ -195,9 +209,9 @@ class Wanted:
         kept = [i for i, name in enumerate(names) if name not in found]
         for name, what in found.items():
             apart = f", and demo={name!r} if it tells the demonstrations apart" if what.startswith("numbers") else ""
-            movements = f"outputs={[names[i] for i in kept]}{apart}"
+            others = [names[i] for i in kept] or [own for own in found if found[own] == "counts rows"] or [name]
             what = f"column {name!r}: it {what}, and is no movement"
-            self.refuse(f"{what}: leave it out, or say {movements}.", "outputs")
+            self.refuse(f"{what}: leave it out, or say outputs={others}{apart}.", "outputs")
         if not found or not kept:
             return positions, labels
         each = {key: [labels[key][i] for i in kept] for key in ("names", "units") if isinstance(labels.get(key), list)}

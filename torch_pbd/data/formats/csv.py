@@ -24,7 +24,7 @@ _DELIMITERS = (",", ";", "\t")
 _LONGEST_HEADER = 2**17  # characters, of thousands of columns; a file without line ends would be one header
 _MOST_COMMENTS = 1000  # lines before the header
 _MISSING = ("", "nan", "+nan", "-nan", "na", "null", "none")
-_CLOCK = re.compile(r"(?:(\d{4}-\d\d-\d\d)[T ])?(\d{1,2}):(\d\d)(?::(\d\d)(?:[.,](\d{1,9}))?)?(?:Z|\+00:?00)?")
+_CLOCK = re.compile(r"(?:([\d-]{10})[T ])?(\d\d?):(\d\d?)(?::(\d\d))?(?:[.,](\d{1,9}))?(?:Z|([+-]\d\d):?(\d\d)?)?")
 _WHOLE = re.compile(r"[+-]?\d{16,19}")  # stamps in ns, which float64 does not hold
 
 
@@ -154,8 +154,11 @@ class _Table:
         match = _CLOCK.fullmatch(cell.strip())
         if match is None:
             return int(cell) if _WHOLE.fullmatch(cell.strip()) else self._read_number(cell)
-        day, hours, minutes, seconds, fraction = match.groups()
-        whole = int(hours) * 3600 + int(minutes) * 60 + int(seconds or 0)
+        day, hours, minutes, seconds, fraction, east, more = match.groups()
+        if seconds is None and (fraction or not day):
+            raise ValueError(f"{cell!r} is hh:mm or mm:ss, must be hh:mm:ss: write 00: before it, or :00 behind.")
+        ahead = int(east or 0) * 60 + int((east or "+")[0] + (more or "0"))  # minutes of local time before UTC
+        whole = (int(hours) * 60 + int(minutes) - ahead) * 60 + int(seconds or 0)
         clock = np.timedelta64(whole * 10**9 + int((fraction or "0").ljust(9, "0")), "ns")
         return np.datetime64(day or "1970-01-01", "ns") + clock
 

@@ -25,7 +25,8 @@ def read(path: Path, wanted: Wanted) -> Arguments:
     """Read the format of `torch_pbd.data.load_demonstrations`."""
     members = read_members(path.read_bytes(), wanted.max_bytes, remedy=f"Raise max_bytes={wanted.max_bytes}.")
     numbers = {int(match[1]) for name in members if (match := re.fullmatch(_NUMBERED, name))}
-    if not ({"meta", "x"} & set(members) or [*members] == ["t"] or numbers):
+    shared = {"t", "x"} <= members.keys() and _read(members, "x").ndim > 1  # else they are columns, as y beside them
+    if not ("meta" in members or [*members] == ["t"] or numbers or shared):
         return _read_other({name: _read(members, name) for name in members}, wanted)
     meta = _read_meta(members)
     if "t" in members:  # one grid of times for all demonstrations
