@@ -48,43 +48,43 @@ class TimeKernel(nn.Module):
         self.register_buffer("_weights", torch.cholesky_solve(rows, root), persistent=False)
         self.register_buffer("_left", rows - own @ self._weights, persistent=False)
 
-    def correlation(self, time: Float[Tensor, " n"], other: Float[Tensor, " m"]) -> Float[Tensor, "d n m"]:
+    def correlation(self, time: Float[Tensor, "*b n"], other: Float[Tensor, "*b m"]) -> Float[Tensor, "d *b n m"]:
         """Correlation between any times; nuggets are linear between steps, and equal times have correlation 1."""
         own, nugget = (_interpolated(self.grid, self.nugget, part) for part in (time, other))
         whole = self._correlation(time, other)
-        whole = whole + torch.where(time[:, None] == other, nugget[:, None], 0.0)
-        return (1.0 + own).rsqrt()[:, :, None] * whole * (1.0 + nugget).rsqrt()[:, None]
+        whole = whole + torch.where(time[..., None] == other[..., None, :], nugget[..., None, :], 0.0)
+        return (1.0 + own).rsqrt()[..., None] * whole * (1.0 + nugget).rsqrt()[..., None, :]
 
     def loadings(self, time: Float[Tensor, " n"]) -> Float[Tensor, "n d K"]:
         """Residuals of the demonstrations at any times: smooth parts by the kernel, remainders linear between steps."""
         left = _interpolated(self.grid, self._left.mT, time)
         return (self._correlation(time, self.grid) @ self._weights + left.mT).transpose(0, 1)
 
-    def _correlation(self, time: Tensor, other: Tensor) -> Float[Tensor, "d n m"]:
+    def _correlation(self, time: Tensor, other: Tensor) -> Float[Tensor, "d *b n m"]:
         own, fine = (_interpolated(self.grid, self.fine, part) for part in (time, other))
         return smooth_correlation(time, other, self.scales, own, fine, self.kernel)
 
 
 def smooth_correlation(
     time: Tensor, other: Tensor, scales: Tensor, fine: Tensor, other_fine: Tensor, kernel: str
-) -> Float[Tensor, "b n m"]:
-    """Correlation, of unit variance, of a slow part and a tremor, between times (n,) and others (m,).
+) -> Float[Tensor, "p *b n m"]:
+    """Correlation, of unit variance, of a slow part and a tremor, between times (*b, n) and others (*b, m).
 
-    There are b pairs ``scales`` (b, 2), and at each time the tremor's variance over the slow part's, (b, n) and (b, m).
+    There are p pairs ``scales`` (p, 2), and at each time the tremor's variance over the slow part's, (p, *b, n or m).
     """
     # Many share a length scale, and the exponentials dominate the cost.
     lengths, places = torch.unique(scales, return_inverse=True)
-    each = correlation(time[:, None], other[:, None], lengths[:, None], kernel)
+    apart = time[..., None] - other[..., None, :]
+    each = correlation(apart.reshape(-1, 1), apart.new_zeros(1, 1), lengths[:, None], kernel)
+    each = each.reshape(-1, *apart.shape)
     slow = each[places[:, 0]]
     if not bool(fine.any()):
         return slow
-    whole = slow + fine.sqrt()[:, :, None] * each[places[:, 1]] * other_fine.sqrt()[:, None]
-    return (1.0 + fine).rsqrt()[:, :, None] * whole * (1.0 + other_fine).rsqrt()[:, None]
+    whole = slow + fine.sqrt()[..., None] * each[places[:, 1]] * other_fine.sqrt()[..., None, :]
+    return (1.0 + fine).rsqrt()[..., None] * whole * (1.0 + other_fine).rsqrt()[..., None, :]
 
 
-def _interpolated(
-    grid: Float[Tensor, " T"], values: Float[Tensor, "*c T"], time: Float[Tensor, " n"]
-) -> Float[Tensor, "*c n"]:
+def _interpolated(grid: Float[Tensor, " T"], values: Float[Tensor, "*c T"], time: Float[Tensor, "*b n"]) -> Tensor:
     """Values at other times, linear between steps and constant beyond them."""
     right = torch.searchsorted(grid, time.contiguous()).clamp(1, len(grid) - 1)
     weight = ((time - grid[right - 1]) / (grid[right] - grid[right - 1])).clamp(0.0, 1.0)

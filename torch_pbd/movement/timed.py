@@ -39,6 +39,7 @@ class TimedMovement(MovementRegressor):
     timing_gain_: float
     _timing: Any = None  # the Timing of movements; None where the law is over the input itself
     _nodes: Nodes  # posterior of duration and pace
+    _predicted: tuple[Floats, Floats, Floats] | None = None  # increasing inputs, and the regressor's moments there
 
     def predict_phase(self, X: ArrayLike) -> tuple[Floats, Floats]:
         """Phase of the movement at times X, estimated from the observations of :meth:`condition`.
@@ -85,8 +86,11 @@ class TimedMovement(MovementRegressor):
         """Laws over phase of movements of these durations and paces (b,), each with its phases at these times (n,)."""
         own, known = (phases(torch.from_numpy(part), duration, pace).numpy() for part in (time, self._known.time))
         laws = [copy.copy(self) for _ in known]
+        # Once for all: the regressor takes about as long for some rows as for hundreds.
+        at = np.unique(np.concatenate([own, known], axis=1))
+        rows = at, *self._regressor_rows(at)
         for law, phase in zip(laws, known, strict=True):
-            law._timing, law._known = None, self._known._replace(time=phase)
+            law._timing, law._known, law._predicted = None, self._known._replace(time=phase), rows
         return list(zip(laws, own, strict=True))
 
     def _score(self, time: Floats, position: Floats) -> float:
@@ -124,10 +128,9 @@ class TimedMovement(MovementRegressor):
             return lambda duration, _: torch.zeros_like(duration)
 
         def log_likelihood(duration: Tensor, pace: Tensor) -> Tensor:
-            law = self._prior(phases(time, duration, pace).flatten().numpy())
-            mean = law.mean.reshape(len(duration), -1)
-            steps, size = torch.arange(len(law.mean)).reshape(len(duration), -1), mean.shape[1]
-            whole = torch.stack([law.at(own).covariance().reshape(size, size) for own in steps])
+            phase = phases(time, duration, pace)
+            mean, covariance = map(torch.from_numpy, self._regressor_rows(phase.flatten().numpy()))
+            mean, whole = mean.reshape(len(phase), -1), self.module_.covariances(phase, covariance)
             whole = whole[:, given][:, :, given] + torch.diag(noise.square().flatten()[given])
             root = safe_cholesky(whole, name="the covariance of what is known")
             return student_log_density(

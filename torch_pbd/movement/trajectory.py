@@ -68,13 +68,24 @@ class TrajectoryLaw(nn.Module):
         self, x: Float[Tensor, " n"], mean: Float[Tensor, "n d"], covariance: Float[Tensor, "n d d"]
     ) -> JointNormal:
         """Joint law at times that are all different, of these marginals."""
+        return JointNormal.prior(mean, *self._parts(x, covariance))
+
+    def _parts(self, x: Float[Tensor, "*b n"], covariance: Float[Tensor, "m d d"]) -> tuple[Tensor, Tensor, Tensor]:
+        """A (m, d, d), correlations (d, *b, n, n) and loadings (m, d, k) of movements at m times in all."""
         kernel, time = self.time_kernel, (x - self.x_shift) / self.x_scale
-        loadings = ((1.0 - kernel.share) / len(kernel.residual)).sqrt() * kernel.loadings(time)
+        loadings = ((1.0 - kernel.share) / len(kernel.residual)).sqrt() * kernel.loadings(time.flatten())
         # A_t divides by the factor of S_tt, so that the blocks of the joint law are those of the marginals.
-        own = loadings @ loadings.mT + kernel.share * torch.eye(mean.shape[1]).to(mean)
+        own = loadings @ loadings.mT + kernel.share * torch.eye(len(self.order)).to(loadings)
         root = root_in_order(covariance, self.order)
         factor = torch.linalg.solve_triangular(torch.linalg.cholesky(own), root, upper=False, left=False)
-        return JointNormal.prior(mean, factor, kernel.share * kernel.correlation(time, time), loadings)
+        return factor, kernel.share * kernel.correlation(time, time), loadings
+
+    def covariances(self, x: Float[Tensor, "b n"], covariance: Float[Tensor, "m d d"]) -> Float[Tensor, "b n*d n*d"]:
+        """Covariances of several movements, each at few times of its own."""
+        factor, correlation, loadings = self._parts(x, covariance)
+        factor, common = factor.unflatten(0, x.shape), (factor @ loadings).unflatten(0, x.shape).flatten(1, 2)
+        along = torch.einsum("bxia,abxy,byja->bxiyj", factor, correlation, factor)
+        return along.flatten(3).flatten(1, 2) + common @ common.mT
 
 
 def root_in_order(covariance: Float[Tensor, "n d d"], order: Int64[Tensor, " d"]) -> Float[Tensor, "n d d"]:
@@ -290,5 +301,8 @@ class TrajectoryRegressor(TimedMovement):
         return self._regressor_rows(time) if self._is_regressor else super()._rows(time)
 
     def _regressor_rows(self, time: Floats) -> tuple[Floats, Floats]:
+        if self._predicted is not None:
+            at, mean, covariance = self._predicted
+            return mean[rows := np.searchsorted(at, time)], covariance[rows]
         mean, covariance = self.regressor_.predict(time[:, np.newaxis], return_cov=True)
         return np.ascontiguousarray(mean.reshape(len(time), self.n_outputs_)), np.ascontiguousarray(covariance)
