@@ -106,6 +106,13 @@ def test_times_of_several_files_count_from_the_first_of_all(tmp_path, kind):
         load_demonstrations(tmp_path / "*.csv", **unit)
 
 
+def test_a_file_of_several_without_samples_is_named(tmp_path):
+    for k, n in enumerate((3, 0)):
+        np.savez(tmp_path / f"{k}.npz", t_0=np.arange(n), x_0=np.ones((n, 2)))
+    with pytest.raises(DataFormatError, match=r"1\.npz: times\[0\] has 0 samples"):
+        load_demonstrations(tmp_path / "*.npz")
+
+
 @pytest.mark.parametrize("cell", ["NA", "None", "null", "", "NaN"])
 def test_words_for_missing_cells_are_dropped_on_request(tmp_path, cell):
     text = "time,x,y\n" + lines(0, 0.5, 1).replace("3.0", cell)

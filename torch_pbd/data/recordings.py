@@ -168,7 +168,8 @@ def _not_missing(grids: Arrays, samples: Arrays) -> list[NDArray[np.intp]]:
 
 def from_common_origin(grids: Arrays) -> Arrays:
     """Times; integers too large for float64 are counted from the first one, so that steps stay exact."""
-    beyond = [grid for grid in grids if grid.dtype.kind in "iu" and max(grid.max(), -int(grid.min())) > 2**53]
+    whole = [grid for grid in grids if grid.dtype.kind in "iu" and grid.size]
+    beyond = [grid for grid in whole if max(grid.max(), -int(grid.min())) > 2**53]
     if not beyond:
         return grids
     origin = min(int(grid.min()) for grid in beyond)
