@@ -235,8 +235,12 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         check_is_fitted(self)
         return np.array([self._score(*recording) for recording in as_recordings(self, X, y, groups, is_fit=False)])
 
-    def score(self, X: Any, y: ArrayLike | None = None, *, groups: ArrayLike | None = None) -> float:
-        """Joint log density of the demonstrations per step, in nats: higher is better."""
+    def score(
+        self, X: Any, y: ArrayLike | None = None, *, groups: ArrayLike | None = None, sample_weight: None = None
+    ) -> float:
+        """Joint log density of the demonstrations per step, in nats: higher is better; pipelines pass the None."""
+        if sample_weight is not None:
+            raise checks.refusal(sample_weight, "sample_weight", "None", "weigh what score_demonstrations returns")
         recordings = as_recordings(self, X, y, groups, is_fit=False)
         return float(sum(self._score(*each) for each in recordings) / sum(len(each.time) for each in recordings))
 

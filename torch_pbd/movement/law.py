@@ -134,7 +134,14 @@ class MovementLaw(BaseEstimator, ABC):
 
     def _times(self, X: ArrayLike) -> Floats:
         """Times (n,) of query rows."""
-        return np.ascontiguousarray(checked_queries(self, X)[:, 0])
+        time = np.ascontiguousarray(checked_queries(self, X)[:, 0])
+        # One lost sample turns a model over time into one over phase, and nothing else would say so.
+        if self.input_ == "phase" and ((time < -checks.ROUNDING) | (time > 1.0 + checks.ROUNDING)).any():
+            checks.warn(
+                f"X goes from {time.min():.6g} to {time.max():.6g}, but the demonstrations' times differ, so X is a "
+                "phase from 0, the start, to 1, the end: divide the time since the start by the movement's duration."
+            )
+        return time
 
     def _union(self, time: Floats, known: Floats) -> tuple[Floats, NDArray[np.intp], NDArray[np.intp]]:
         """Distinct times of queries and observations, and the indices of both among them."""
@@ -204,6 +211,8 @@ def as_recordings(model: Any, X: Any, y: Any, groups: Any, *, is_fit: bool) -> l
         model.input_ = "array"
         if groups is None:
             raise ValueError("groups is None, must be the demonstration of each row of X: whole movements are learned.")
+    else:
+        model._times(X)
     if y is None:
         raise ValueError("y is None, must be the positions (n_samples, n_outputs) at the rows of X.")
     inputs, targets = checked_rows(model, X, y, reset=is_fit, ensure_min_samples=1)
@@ -212,15 +221,13 @@ def as_recordings(model: Any, X: Any, y: Any, groups: Any, *, is_fit: bool) -> l
             f"X has {inputs.shape[1]} columns, must have one, the time or phase: a movement runs along one input."
         )
     if is_fit:
-        model._y_is_1d = targets.ndim == 1
-        model.n_outputs_ = 1 if model._y_is_1d else targets.shape[1]
-    targets = targets.reshape(len(inputs), -1)
-    if targets.shape[1] != model.n_outputs_:
-        raise ValueError(f"y has {targets.shape[1]} outputs, but the model was fitted with {model.n_outputs_}.")
+        model._y_is_1d, model.n_outputs_ = targets.ndim == 1, targets[0].size
+    if targets[0].size != model.n_outputs_:
+        raise ValueError(f"y has {targets[0].size} outputs, but the model was fitted with {model.n_outputs_}.")
     numbers = np.zeros(len(inputs), dtype=np.intp) if groups is None else check_groups(groups, len(inputs))
     order = np.lexsort([inputs[:, 0], numbers])
     parts = np.split(order, np.flatnonzero(np.diff(numbers[order])) + 1)
-    return [Demonstration(inputs[rows, 0], targets[rows]) for rows in parts]
+    return [Demonstration(inputs[rows, 0], targets[rows].reshape(len(rows), -1)) for rows in parts]
 
 
 def as_rows(recordings: list[Demonstration]) -> tuple[Floats, Floats, NDArray[np.intp]]:
