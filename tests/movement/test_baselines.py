@@ -4,13 +4,19 @@ import pickle
 
 import numpy as np
 import pytest
+import sklearn
 from lc_ns_kmp import LC_NS_KMP
 from movement_primitives.promp import ProMP
 from scipy.stats import multivariate_normal
 from sklearn.base import clone
+from sklearn.model_selection import GroupKFold, cross_val_score
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import MinMaxScaler
 
 from movement.test_trajectory import GRID, gaussian_conditional, movements, stacked
-from torch_pbd import KMPBaseline, ProMPBaseline, load_demonstrations
+from torch_pbd import Demonstrations, KMPBaseline, ProMPBaseline, load_demonstrations
+from torch_pbd.exceptions import DataRankWarning
+from torch_pbd.movement.promp import basis_functions
 
 X = GRID[:, np.newaxis]
 
@@ -72,19 +78,28 @@ def test_promp_reaches_what_it_should_on_letters(recordings):
     assert np.mean(scores) > 150.0
 
 
+def standardized_reference(model, time):
+    """Mean and covariance of the reference of ``movements(8)``, standardized, and their mean and deviation."""
+    y = movements(8).reshape(-1, 2)
+    shift, scale = y.mean(axis=0), y.std(axis=0)
+    mean, covariance = model.regressor_.predict(time, return_cov=True)
+    return (mean - shift) / scale, covariance / np.outer(scale, scale), shift, scale
+
+
 def test_kmp_has_the_mean_of_the_published_one():
     model = fit(KMPBaseline(n_reference=40, length_scale=0.2, lambda_mean=2.0), movements(8))
     time = np.linspace(0.0, 1.0, 40)[:, np.newaxis]
-    mean, covariance = model.regressor_.predict(time, return_cov=True)
+    mean, covariance, shift, scale = standardized_reference(model, time)
     rate = 0.5 / 0.2**2  # k = exp(-l r^2)
     other = LC_NS_KMP(output_dim=2, horizon=40, lambda_=2.0, l=rate)
-    np.testing.assert_allclose(model.predict(time), other.predict(time, time, mean, covariance), atol=1e-6)
+    expected = shift + scale * other.predict(time, time, mean, covariance)
+    np.testing.assert_allclose(model.predict(time), expected, atol=1e-6)
 
 
 def test_kmp_has_the_covariance_of_its_equation():
     model = fit(KMPBaseline(n_reference=25, nugget=1e-6), movements(8))
     reference = np.linspace(0.0, 1.0, 25)
-    _, covariances = model.regressor_.predict(reference[:, np.newaxis], return_cov=True)
+    _, covariances, _, scale = standardized_reference(model, reference[:, np.newaxis])
 
     def kernel(a, b):
         return np.kron(np.exp(-0.5 * np.square((a[:, np.newaxis] - b) / 0.144)), np.eye(2))
@@ -95,7 +110,7 @@ def test_kmp_has_the_covariance_of_its_equation():
     at = np.array([0.1, 0.52])
     cross = kernel(at, reference)
     expected = kernel(at, at) - cross @ np.linalg.solve(kernel(reference, reference) + 60.0 * noise, cross.T)
-    own = model.predict_joint(at[:, np.newaxis])[1].reshape(4, 4)
+    own = model.predict_joint(at[:, np.newaxis])[1].reshape(4, 4) / np.outer(*2 * [np.tile(scale, 2)])
     np.testing.assert_allclose(own, 25.0 / 60.0 * expected, atol=1e-5)
 
 
@@ -110,6 +125,88 @@ def test_kmp_passes_its_via_points_and_keeps_the_outputs_that_are_not_given():
     np.testing.assert_allclose(again.predict([[0.8]]), [[0.1, 0.1]], atol=0.03)
     # The nearest time of the reference moved; the model that was conditioned is as it was.
     np.testing.assert_array_equal(model.predict([[0.5]])[0], before)
+
+
+@pytest.mark.parametrize("make", [ProMPBaseline, KMPBaseline])
+@pytest.mark.parametrize(("unit", "origin"), [(1e3, 0.0), (1e-6, 0.0), (1.0, 100.0), ([1e3, 1e-2], [0.0, -70.0])])
+def test_units_and_origins_of_outputs_decide_nothing(make, unit, origin):
+    demos = movements(6)
+    # Half of the recordings end early: what is not seen of them is not at the origin.
+    inputs, y, groups = stacked(demos)
+    seen = (groups % 2 == 0) | (inputs[:, 0] < 0.6)
+    unit, origin = np.broadcast_to(unit, 2), np.asarray(origin)
+    model, other = (
+        make().fit(inputs[seen], part[seen], groups=groups[seen]).condition([[0.5]], via, noise_scale=noise)
+        for part, via, noise in (
+            (y, [[0.4, np.nan]], 0.1),
+            (origin + unit * y, origin + [[0.4, np.nan]] * unit, 0.1 * unit),
+        )
+    )
+    (mean, covariance), (own, own_covariance) = (each.predict_joint(X) for each in (model, other))
+    np.testing.assert_allclose((own - origin) / unit, mean, rtol=0, atol=1e-9)
+    own_covariance = own_covariance / unit[:, np.newaxis, np.newaxis] / unit
+    np.testing.assert_allclose(own_covariance, covariance, rtol=0, atol=1e-9)
+
+
+def test_promp_takes_what_a_recording_that_ends_early_does_not_show_from_the_others():
+    once = basis_functions(GRID, 8, 0.7) @ np.random.default_rng(0).normal(size=(8, 2))
+    inputs, y, groups = stacked(np.stack([once] * 6))
+    seen = (groups % 2 == 0) | (inputs[:, 0] < 0.6)
+    model, partial = ProMPBaseline(n_basis=8, overlap=0.7), ProMPBaseline(n_basis=8, overlap=0.7)
+    with pytest.warns(DataRankWarning, match="The demonstrations are identical: their covariance is zero"):
+        model.fit(inputs, y, groups=groups)
+    partial.fit(inputs[seen], y[seen], groups=groups[seen])
+    for each in (model, partial):
+        np.testing.assert_allclose(each.predict(X), once, atol=1e-3)
+
+
+def test_scores_pass_through_a_pipeline_with_the_groups():
+    inputs, y, groups = stacked(movements(6))
+    with sklearn.config_context(enable_metadata_routing=True):
+        model = ProMPBaseline(n_basis=8).set_fit_request(groups=True).set_score_request(groups=True)
+        options = {"params": {"groups": groups}, "cv": GroupKFold(3), "error_score": "raise"}
+        alone, piped = (
+            cross_val_score(each, inputs, y, **options) for each in (model, make_pipeline(MinMaxScaler(), model))
+        )
+    np.testing.assert_allclose(piped, alone, rtol=1e-9)
+    fitted = fit(model, movements(6))
+    with pytest.raises(ValueError, match=r"sample_weight is .*, must be None: weigh what score_demonstrations returns"):
+        fitted.score(inputs, y, groups=groups, sample_weight=np.ones(len(y)))
+
+
+def test_times_are_told_where_a_lost_sample_made_phases_of_them(recwarn):
+    demos, seconds = movements(6), 2.0 * GRID
+    over_time = ProMPBaseline(n_basis=8).fit(Demonstrations(seconds, demos))
+    lost = Demonstrations([seconds] * 5 + [seconds[:-1]], [*demos[:5], demos[5, :-1]])
+    model = ProMPBaseline(n_basis=8).fit(lost)
+    at, value = np.array([[1.5]]), np.array([[0.4, 0.4]])
+    over_time.condition(at, value).sample_demonstrations(2.0 * X)
+    assert model.score(lost) == pytest.approx(over_time.score(Demonstrations(seconds, demos)), rel=0.1)
+    model.condition(at / 2.0, value).sample_demonstrations(X)
+    model.score(X * (1.0 + 1e-12), demos[0])
+    assert not recwarn.list
+    for use in (
+        lambda: model.predict(at),
+        lambda: model.predict_cov(-at),
+        lambda: model.condition(at, value),
+        lambda: model.score(2.0 * X, demos[0]),
+        lambda: model.score_demonstrations(2.0 * X, demos[0]),
+        lambda: model.log_likelihood(at, value),
+    ):
+        with pytest.warns(UserWarning, match="times differ, so X is a phase from 0, the start, to 1, the end: divide"):
+            use()
+
+
+@pytest.mark.parametrize("make", [ProMPBaseline, KMPBaseline])
+@pytest.mark.parametrize("value", [0.5, -1e9])
+def test_a_constant_output_is_predicted_beside_others(make, value):
+    demos = movements(6)
+    model = fit(make(), np.concatenate([demos, np.full((6, 30, 1), value)], axis=2))
+    mean, covariance = model.predict_joint(X)
+    np.testing.assert_allclose(mean[:, 2], value, rtol=1e-9)
+    assert model.score(X, np.column_stack([demos[0], np.full(30, value)])) > fit(make(), demos).score(X, demos[0])
+    scale = np.sqrt(np.diagonal(covariance.reshape(90, 90)).reshape(30, 3))
+    assert (scale[:, 2] < 0.2 * scale[:, :2].max()).all()
 
 
 @pytest.mark.parametrize("make", [ProMPBaseline, KMPBaseline])

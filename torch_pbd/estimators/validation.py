@@ -16,6 +16,7 @@ from torch_pbd.data.description import follow_one_way
 from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.models.training import TrainingSet
 
+ALIKE = "The demonstrations are identical: their covariance is zero, and the smallest that can be told from it is used."
 CONSTANT = 1e-11
 """A column whose spread is below this share of its largest value differs only by rounding."""
 
@@ -228,11 +229,7 @@ def warn_if_identical(training: TrainingSet) -> None:
     repeated = len(training.y) - len(training.inputs)
     squares = training.squares if repeated else (training.y - training.y.mean(0)).square()
     if float(squares.sum(0).max()) < 1e-18 * max(1, repeated or len(training.y) - 1):
-        checks.warn(
-            "The demonstrations are identical: their covariance is zero, and the smallest that can be told "
-            "from it is used.",
-            DataRankWarning,
-        )
+        checks.warn(ALIKE, DataRankWarning)
 
 
 def fit_with_groups(regressor: Any, X: ArrayLike, y: ArrayLike, groups: ArrayLike) -> Any:

@@ -12,6 +12,7 @@ from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.data.demonstrations import Demonstration
 from torch_pbd.estimators.base import CovarianceRegressor
+from torch_pbd.estimators.door import Standardization
 from torch_pbd.estimators.mixture import GMMBaseline
 from torch_pbd.estimators.validation import fit_with_groups
 from torch_pbd.files.memory import require_much
@@ -19,7 +20,8 @@ from torch_pbd.movement.base import MovementRegressor
 from torch_pbd.movement.joint import Conditioned, JointNormal
 from torch_pbd.movement.law import as_rows, check_arrays, semidefinite_root
 
-_ARRAYS = ("reference.time", "reference.mean", "reference.covariance", "range", "deviation")  # names in model files
+_ARRAYS = ("reference.time", "reference.mean", "reference.covariance", "range", "shift", "scale")  # in model files
+_LEAST = 1e-6  # least variance in the reference, of standardized outputs; the paper's of a point without noise
 
 
 @dataclass(eq=False, repr=False)
@@ -28,7 +30,8 @@ class KMPBaseline(MovementRegressor):
 
     With the reference's means mu_i and covariances S_i at N times, block diagonal S, the mean at t is
     ``k_t (K + lambda_mean S)^-1 mu`` and the covariance between t and t' is
-    ``N / lambda_cov (k(t, t') I - k_t (K + lambda_cov S)^-1 k_t')``. Via points replace the nearest points of the
+    ``N / lambda_cov (k(t, t') I - k_t (K + lambda_cov S)^-1 k_t')``, of standardized outputs, since the kernel's
+    variance is 1 and the mean returns to 0 far from the reference. Via points replace the nearest points of the
     reference, as in the reference paper; this is not the law of a conditioned movement.
 
     Parameters
@@ -81,20 +84,27 @@ class KMPBaseline(MovementRegressor):
         X, y, groups = as_rows(recordings)
         regressor = GMMBaseline() if self.regressor is None else clone(self.regressor)
         self.regressor_ = fit_with_groups(regressor, X, y, groups)
-        self._scale = y.std(axis=0)
+        scaling = Standardization.fit(X, y)
+        self._shift, self._scale = shift, scale = scaling.y_shift, scaling.y_scale
         time = np.linspace(X.min(), X.max(), int(self.n_reference))
-        self._reference = time, *self.regressor_.predict(time[:, np.newaxis], return_cov=True)
+        mean, covariance = self.regressor_.predict(time[:, np.newaxis], return_cov=True)
+        # An output that is constant, or a copy of another, would leave no factor of K + lambda S.
+        values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+        covariance = vectors * values.clip(_LEAST)[:, np.newaxis] @ vectors.transpose(0, 2, 1)
+        self._reference = time, (mean - shift) / scale, covariance
 
     def _arrays(self) -> dict[str, Floats]:
-        arrays = *self._reference, np.array(self._range), self._scale
+        arrays = *self._reference, np.array(self._range), self._shift, self._scale
         return dict(zip(_ARRAYS, arrays, strict=True))
 
     def _restore(self, arrays: dict[str, Floats]) -> None:
         n, d = len(np.atleast_1d(arrays["reference.time"])), self.n_outputs_
-        check_arrays(arrays, dict(zip(_ARRAYS, [(n,), (n, d), (n, d, d), (2,), (d,)], strict=True)))
-        *reference, (low, width), self._scale = (arrays[name] for name in _ARRAYS)
-        checks.semidefinite(reference[2], "reference.covariance", definite=True)
-        self._reference, self._range = tuple(reference), (float(low), checks.number(width, "the range of X", above=0.0))
+        check_arrays(arrays, dict(zip(_ARRAYS, [(n,), (n, d), (n, d, d), (2,), (d,), (d,)], strict=True)))
+        time, mean, covariance, (low, width), self._shift, self._scale = (arrays[name] for name in _ARRAYS)
+        checks.require(self._scale > 0.0, self._scale, "scale", "above 0")
+        checks.semidefinite(covariance, "reference.covariance", definite=True)
+        self._reference = time, mean, covariance
+        self._range = float(low), checks.number(width, "the range of X", above=0.0)
 
     def _prior(self, time: Floats) -> JointNormal:
         n, d = len(time), self.n_outputs_
@@ -105,17 +115,18 @@ class KMPBaseline(MovementRegressor):
         # Time by time, all outputs of each: the kernel of the times acts on each output separately.
         gram = np.kron(self._kernel(time, time), np.eye(d))
         root = semidefinite_root(level * (gram - explained @ explained.T)).reshape(n, d, -1)
-        return JointNormal.with_noise(*map(torch.from_numpy, (mean, root, self._nugget_scale())))
+        root *= self._scale[:, np.newaxis]
+        return JointNormal.with_noise(*map(torch.from_numpy, (mean, root, np.sqrt(self.nugget) * self._scale)))
 
     def _rows(self, time: Floats) -> tuple[Floats, Floats]:
         # Each row alone: the covariance between rows would cost the cube of their number to factorize.
         mean, whitened, level = self._through_reference(time)
         explained = whitened.transpose(0, 2, 1) @ whitened
-        nugget = np.diag(np.square(self._nugget_scale()))
-        return mean, level * (np.eye(self.n_outputs_) - 0.5 * (explained + explained.transpose(0, 2, 1))) + nugget
+        own = (level + self.nugget) * np.eye(self.n_outputs_) - 0.5 * level * (explained + explained.transpose(0, 2, 1))
+        return mean, np.outer(self._scale, self._scale) * own
 
     def _through_reference(self, time: Floats) -> tuple[Floats, Floats, float]:
-        """Mean (n, d), ``V_t = L^-1 k_t'`` (n, N d, d) with ``L L' = K + lambda_cov S``, and ``N / lambda_cov``."""
+        """Mean (n, d), unitless ``V_t = L^-1 k_t'`` (n, N d, d), ``L L' = K + lambda_cov S``; ``N / lambda_cov``."""
         reference, means, covariances = self._with_via_points()
         n_reference, d = means.shape
         gram, noise = np.kron(self._kernel(reference, reference), np.eye(d)), block_diag(*covariances)
@@ -123,30 +134,26 @@ class KMPBaseline(MovementRegressor):
         root = np.linalg.cholesky(gram + self.lambda_cov * noise)
         inverse = solve_triangular(root, np.eye(len(root)), lower=True).reshape(-1, n_reference, d)
         cross = self._kernel(time, reference)
-        return cross @ weights, np.tensordot(cross, inverse, axes=(1, 1)), n_reference / self.lambda_cov
-
-    def _nugget_scale(self) -> Floats:
-        """Standard deviation of the independent part of each output (d,)."""
-        return np.sqrt(self.nugget) * np.where(self._scale > 0.0, self._scale, 1.0)
+        mean = self._shift + self._scale * (cross @ weights)
+        return mean, np.tensordot(cross, inverse, axes=(1, 1)), n_reference / self.lambda_cov
 
     def _kernel(self, time: Floats, other: Floats) -> Floats:
         difference = self._scaled(time)[:, np.newaxis] - self._scaled(other)
         return np.asarray(np.exp(-0.5 * np.square(difference / self.length_scale)))
 
     def _with_via_points(self) -> tuple[Floats, Floats, Floats]:
-        """Reference whose nearest times are replaced by the via points; outputs that are not given stay."""
+        """Standardized reference, nearest times replaced by the via points; outputs that are not given stay."""
         if not len(self._known.time):
             return self._reference
-        axes = self._observed_axes
+        axes, shift = self._observed_axes * self._scale, self._observed_axes @ self._shift
         time, means = self._reference[0].copy(), self._reference[1] @ axes.T
         covariances = axes @ self._reference[2] @ axes.T
-        # The paper gives a point without noise the variance 1e-6.
-        least = 1e-6 * np.square(axes * self._scale).sum(axis=1)
+        least = _LEAST * np.square(axes).sum(axis=1)
         for at, value, noise in zip(*self._known, strict=True):
             nearest = int(np.abs(self._reference[0] - at).argmin())
             given = ~np.isnan(value)
             time[nearest] = at
-            means[nearest, given] = value[given]
+            means[nearest, given] = (value - shift)[given]
             covariances[nearest][given] = covariances[nearest][:, given] = 0.0
             covariances[nearest][given, given] = np.maximum(np.square(noise), least)[given]
         back = np.linalg.inv(axes)

@@ -11,9 +11,12 @@ import torch
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.data.demonstrations import Demonstration
+from torch_pbd.estimators.door import Standardization
+from torch_pbd.estimators.validation import ALIKE
+from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.movement.base import MovementRegressor
 from torch_pbd.movement.joint import JointNormal
-from torch_pbd.movement.law import check_arrays, semidefinite_root
+from torch_pbd.movement.law import as_rows, check_arrays, semidefinite_root
 
 _N_BASES = (8, 12, 16, 20)  # candidates of "auto", as far as recordings have enough samples
 _REACHES = (1.0, 2.0, 4.0)  # candidate length scales of the smooth prior, in bases
@@ -27,9 +30,9 @@ _MOST_LEFT_OUT = 40  # most demonstrations that are left out in turn
 class ProMPBaseline(MovementRegressor):
     """Probabilistic movement primitive: x_t = Psi_t w + noise, with normally distributed weights w.
 
-    Bases are normalized Gaussians over the time; the weights of each demonstration are found by ridge regression. Their
-    covariance is singular for fewer demonstrations than weights: it is shrunk towards a smooth one, a squared
-    exponential over the bases' numbers times the covariance of the outputs.
+    Bases are normalized Gaussians over the time; a ridge regression finds the weights of each demonstration, near those
+    of all together. Their covariance is singular for fewer demonstrations than weights: it is shrunk towards a smooth
+    one, a squared exponential over the bases' numbers times the covariance of the outputs.
 
     Parameters
     ----------
@@ -86,7 +89,9 @@ class ProMPBaseline(MovementRegressor):
         checks.seed(self.random_state)
 
     def _fit(self, recordings: list[Demonstration]) -> None:
-        scaled = [Demonstration(self._scaled(time), position) for time, position in recordings]
+        # A ridge shrinks towards 0, which must be a position of the movement, and not the user's origin.
+        scaling = Standardization.fit(*as_rows(recordings)[:2])
+        scaled = [Demonstration(self._scaled(time), scaling.outputs(y, exact=True)) for time, y in recordings]
         most = max(2, min(len(time) for time, _ in recordings) - 1)
         sizes = _N_BASES if self.n_basis == "auto" else (int(self.n_basis),)
         overlaps = _OVERLAPS if self.overlap == "auto" else (float(self.overlap),)
@@ -96,9 +101,12 @@ class ProMPBaseline(MovementRegressor):
         choices = itertools.product(candidates, _REACHES, shares)
         weights, reach, share = max(choices, key=lambda choice: choice[0].left_out(*choice[1:]))
         self.n_basis_, self.overlap_, self.reach_, self.shrinkage_ = weights.n_basis, weights.overlap, reach, share
-        self.weight_mean_ = weights.values.mean(axis=0)
-        self.weight_covariance_ = weights.covariance(weights.values, reach, share)
-        self.noise_scale_ = weights.noise_scale
+        if weights.values.std(axis=0).max() < 1e-9:
+            checks.warn(ALIKE, DataRankWarning)
+        # The bases sum to one, so that a shift of all weights is one of the movement.
+        self.weight_mean_ = scaling.y_shift + scaling.y_scale * weights.values.mean(axis=0)
+        self.weight_covariance_ = weights.covariance(scaling.y_scale * weights.values, reach, share)
+        self.noise_scale_ = scaling.y_scale * weights.noise_scale
 
     def _arrays(self) -> dict[str, Floats]:
         names = ("weight_mean_", "weight_covariance_", "noise_scale_")
@@ -116,8 +124,10 @@ class ProMPBaseline(MovementRegressor):
 
     def _prior(self, time: Floats) -> JointNormal:
         bases = basis_functions(self._scaled(time), self.n_basis_, self.overlap_)
-        root = semidefinite_root(self.weight_covariance_).reshape(self.n_basis_, self.n_outputs_, -1)
-        loadings = np.einsum("nb,bdk->ndk", bases, root)
+        # In units of the noise: rounding of an output in large numbers would be all of one in small numbers.
+        scale = np.tile(self.noise_scale_, self.n_basis_)
+        root = semidefinite_root(self.weight_covariance_ / np.outer(scale, scale)) * scale[:, np.newaxis]
+        loadings = np.einsum("nb,bdk->ndk", bases, root.reshape(self.n_basis_, self.n_outputs_, -1))
         return JointNormal.with_noise(*map(torch.from_numpy, (bases @ self.weight_mean_, loadings, self.noise_scale_)))
 
 
@@ -127,19 +137,14 @@ class _Weights:
     def __init__(self, recordings: list[Demonstration], n_basis: int, overlap: float, ridge: float) -> None:
         self.n_basis, self.overlap = n_basis, overlap
         self._samples = [(basis_functions(time, n_basis, overlap), position) for time, position in recordings]
-        weights, residuals = [], []
-        for bases, position in self._samples:
-            gram = bases.T @ bases
-            matrix = gram + ridge * gram.trace() / n_basis * np.eye(n_basis)
-            weights.append(np.linalg.solve(matrix, bases.T @ position))
-            residuals.append(position - bases @ weights[-1])
+        # A recording that ends early says nothing of its last weights, which are then those of all together.
+        common = _ridge_weights(*map(np.concatenate, zip(*self._samples, strict=True)), ridge=ridge)
+        weights = [common + _ridge_weights(bases, y - bases @ common, ridge=ridge) for bases, y in self._samples]
+        residual = np.concatenate([y - bases @ own for (bases, y), own in zip(self._samples, weights, strict=True)])
         self.values: Floats = np.stack(weights)  # (K, n_basis, d)
-        deviation = np.concatenate([position for _, position in recordings]).std(axis=0)
-        least = _LEAST_NOISE * np.where(deviation > 0.0, deviation, 1.0)
-        residual = np.concatenate(residuals)
         # Degrees of freedom: samples minus the weights that were fitted to them.
         freedoms = max(1, len(residual) - n_basis * len(recordings))
-        self.noise_scale: Floats = np.maximum(np.sqrt(np.square(residual).sum(axis=0) / freedoms), least)
+        self.noise_scale: Floats = np.maximum(np.sqrt(np.square(residual).sum(axis=0) / freedoms), _LEAST_NOISE)
 
     def covariance(self, values: Floats, reach: float, share: float) -> Floats:
         """Shrunk covariance (B d, B d) of weights (K, B, d)."""
@@ -172,6 +177,11 @@ class _Weights:
             log_det = np.linalg.slogdet(matrix).logabsdet + 2.0 * len(bases) * np.log(self.noise_scale).sum()
             total -= 0.5 * (log_det + np.square(residual).sum() - explained + position.size * np.log(2.0 * np.pi))
         return float(total)
+
+
+def _ridge_weights(bases: Floats, position: Floats, *, ridge: float) -> Floats:
+    gram = bases.T @ bases
+    return np.linalg.solve(gram + ridge * gram.trace() / len(gram) * np.eye(len(gram)), bases.T @ position)
 
 
 def basis_functions(time: Floats, n_basis: int, overlap: float) -> Floats:
