@@ -1,9 +1,12 @@
 """Movements of unknown timing: against dense brute force, made data whose timing is known, and the laws of mixtures."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
 from scipy.stats import f, multivariate_t
+from scipy.stats import t as student
 
 import torch_pbd
 from torch_pbd import Demonstrations, DMPController, GMMBaseline, TrajectoryRegressor, load_demonstrations
@@ -91,6 +94,25 @@ def test_the_posterior_is_that_of_a_fine_grid(width):
     below = timing.posterior(lambda duration, _: torch.zeros_like(duration), last).log_integral
     of_prior = np.where(runs, np.exp(prior), 0.0).sum()
     assert nodes.log_integral - below == pytest.approx(float((weight.sum() / of_prior).log()), abs=0.05)
+
+
+def test_the_posterior_of_a_whole_movement_is_found_against_its_end():
+    # Student's t of many samples, narrow beside the time of the last one and with long tails.
+    timing, last = Timing(torch.tensor([0.7, 0.0]).double(), torch.tensor([[0.2, 0.0], [-0.1, 0.5]]).double(), 5.0), 2.0
+
+    def likelihood(duration, pace):
+        ridge = (duration.log() - math.log(last) - 0.1 * (pace - 0.3)) / 0.004
+        return -41.5 * torch.log1p(ridge.square() + ((pace - 0.3) / 0.05).square())
+
+    log_t, pace = (torch.linspace(math.log(last), math.log(last) + 0.02, 801), torch.linspace(0.1, 0.5, 801))
+    values = torch.cartesian_prod(log_t.double(), pace.double())
+    prior = multivariate_t(timing.location, timing.root @ timing.root.mT, df=5.0).logpdf(values)
+    weight = torch.from_numpy(prior) + likelihood(values[:, 0].exp(), values[:, 1])
+    nodes = timing.posterior(likelihood, last)
+    below = timing.posterior(lambda duration, _: torch.zeros_like(duration), last).log_integral
+    of_prior = student.sf((math.log(last) - 0.7) / 0.2, 5.0)
+    expected = float(weight.logsumexp(0)) + math.log(0.02 / 800 * 0.4 / 800 / of_prior)
+    assert nodes.log_integral - below == pytest.approx(expected, abs=0.05)
 
 
 def test_where_durations_do_not_differ_the_posterior_is_of_the_pace():

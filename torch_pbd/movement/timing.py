@@ -120,22 +120,24 @@ class Timing:
         if last > 0.0 and self.root[0, 0] > 0.0:
             cut = float((math.log(last) - self.location[0]) / self.root[0, 0])
         for likelihood in filter(None, (log_likelihood, exact)):
+            power = 0.0
             for _ in range(_MOST_LATTICES):
-                nodes, center, root, is_resolved = self._lattice(likelihood, center, root, cut, _SIDE)
-                if is_resolved:
+                nodes, center, root, power = self._lattice(likelihood, center, root, cut, _SIDE, power)
+                if not self._is_narrow(nodes.weight):
                     break
-        nodes, *_ = self._lattice(exact or log_likelihood, center, root, cut, _SIDE_LAST)
+        nodes, *_ = self._lattice(exact or log_likelihood, center, root, cut, _SIDE_LAST, 0.0)
         kept = nodes.weight > 1e-3 * nodes.weight.max()
         weight = nodes.weight[kept] / nodes.weight[kept].sum()
         return Nodes(nodes.duration[kept], nodes.pace[kept], weight, nodes.log_integral)
 
     def _lattice(
-        self, log_likelihood: Likelihood, center: Tensor, root: Tensor, cut: float, side: int
-    ) -> tuple[Nodes, Tensor, Tensor, bool]:
-        """Midpoints of a lattice's cells, center and root of the next lattice, and whether this one is fine enough.
+        self, log_likelihood: Likelihood, center: Tensor, root: Tensor, cut: float, side: int, least: float
+    ) -> tuple[Nodes, Tensor, Tensor, float]:
+        """Midpoints of a lattice's cells, and center and root of the next lattice with the power that placed it.
 
         Durations depend on the first axis alone, as ``root`` is a lower factor; it is cut where movements would have
-        ended. Where too few nodes carry the weight, a power of the likelihood places the next lattice.
+        ended. Where too few nodes carry the weight, a power of the likelihood places the next lattice. It is above
+        ``least``, that of the last one: a posterior that leans against the cut, with a long tail, would stay there.
         """
         low = min(max(float((cut - center[0]) / root[0, 0]), -_REACH), 0.9 * _REACH)
         axes, cell = [], root.new_ones(2)
@@ -151,7 +153,7 @@ class Timing:
         log_prior = -0.5 * (self.df + n_varying) * torch.log1p(z.square().sum(1) / self.df)
         value, power = log_likelihood(duration, pace), 1.0
         # At power zero only the prior is left, which may itself be narrow on a first lattice.
-        while float((wide := (log_prior + power * value).softmax(0)).square().sum()) > _FEW**-n_varying and power:
+        while self._is_narrow(wide := (log_prior + power * value).softmax(0)) and power > 2.0 * least:
             power = 0.5 * power if power > _LEAST_POWER else 0.0
         log_weight = log_prior + value
         scale = root * cell
@@ -160,7 +162,11 @@ class Timing:
         # A node stands for its cell, in which the variance is a twelfth of its square.
         finer = torch.linalg.cholesky(spread.mT @ (wide[:, None] * spread) + scale @ scale.mT / 12.0)
         log_integral = float(log_weight.logsumexp(0) + scale.diagonal().log().sum())
-        return Nodes(duration, pace, log_weight.softmax(0), log_integral), center, finer, power == 1.0
+        return Nodes(duration, pace, log_weight.softmax(0), log_integral), center, finer, power
+
+    def _is_narrow(self, weight: Tensor) -> bool:
+        """Whether too few nodes carry the weight."""
+        return float(weight.square().sum()) > _FEW ** -int((self.root.diagonal() > 0.0).sum())
 
     def _reach(self) -> float:
         return math.sqrt(self.df * math.expm1(2.0 * _RARE / (self.df + 2.0)))
