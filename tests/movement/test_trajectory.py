@@ -22,7 +22,7 @@ from torch_pbd import (
     load_demonstrations,
 )
 from torch_pbd.kernels import correlation
-from torch_pbd.movement import time_kernel_fit, trajectory
+from torch_pbd.movement import time_kernel_fit
 from torch_pbd.movement.time_kernel_fit import fit_time_kernel, smoothest_first
 
 GRID = np.linspace(0.0, 1.0, 30)
@@ -340,7 +340,7 @@ def test_degrees_of_freedom_are_the_likeliest_of_demonstrations():
             for k in range(200)
         ]
         square, size = (torch.tensor([each(row) for row in rows]) for each in (lambda row: row @ row, len))
-        found = trajectory.movement_df(square, size, most)
+        found = time_kernel_fit.movement_df(square, size, most)
         assert few <= found <= many
 
         def value(df, rows=rows):
@@ -356,7 +356,7 @@ def test_large_demonstrations_widen_the_law_and_do_not_make_draws_of_all_rough(m
     X, y, groups = stacked(demos)
     rough = []
     for rounds in (2, 1):
-        monkeypatch.setattr(trajectory, "_ROUNDS", rounds)
+        monkeypatch.setattr(time_kernel_fit, "_FITS", rounds)
         model = TrajectoryRegressor(CholeskyCovRegressor()).fit(X, y, groups=groups)
         assert model.df_ < 8.0
         rough.append(np.median(np.square(np.diff(model.sample_demonstrations(X[:30], 500, 0), 2, axis=1)).mean((1, 2))))

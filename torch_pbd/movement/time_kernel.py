@@ -11,12 +11,16 @@ little variance left of their own. A single kernel for all outputs must be as ro
 are then rougher and longer than demonstrations.
 """
 
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from torch_pbd.kernels import correlation
-from torch_pbd.linalg import safe_cholesky
+from torch_pbd.linalg import safe_cholesky, symmetrize
 
 
 class TimeKernel(nn.Module):
@@ -89,3 +93,56 @@ def _interpolated(grid: Float[Tensor, " T"], values: Float[Tensor, "*c T"], time
     right = torch.searchsorted(grid, time.contiguous()).clamp(1, len(grid) - 1)
     weight = ((time - grid[right - 1]) / (grid[right] - grid[right - 1])).clamp(0.0, 1.0)
     return torch.lerp(values[..., right - 1], values[..., right], weight)
+
+
+class LeftOut(NamedTuple):
+    """Highest log likelihood of demonstrations left out in turn, its share, and their squared distances under it."""
+
+    log_likelihood: float
+    share: float
+    square: Float[Tensor, " K"]
+
+
+def left_out(kernel: TimeKernel, shares: Sequence[float]) -> LeftOut:
+    """Highest log likelihood of the demonstrations, each under the law of the others' residuals.
+
+    In this law ``z = C^-1 y``, y has the covariance ``S = share R + (1 - share) / (K - 1) sum z z'`` over the
+    others, and ``C_t = chol S_tt`` keeps the marginals: it bends the smooth part, at a cost where that has little
+    variance. With the Gram matrix G of all under R^-1, ``M = G + a I``, ``a = share (K - 1) / (1 - share)`` and
+    ``c = Z' R^-1 y``, the squared distance is ``(y' R^-1 y - c' M^-1 c) / share`` and the determinant that of M over
+    the others, whose inverse follows from that of all by removing one row.
+    """
+    n_demos, n_steps, d = kernel.residual.shape
+    if n_demos < 3:  # a single other demonstration has no covariance
+        return LeftOut(0.0, shares[0], kernel.residual.square().sum((1, 2)))
+    root = safe_cholesky(kernel.correlation(kernel.grid, kernel.grid), name="the correlation along the movement")
+    residual = kernel.residual
+
+    def whiten(rows: Float[Tensor, "K T d"]) -> Float[Tensor, "K s"]:
+        return torch.linalg.solve_triangular(root, rows.permute(2, 1, 0), upper=False).flatten(0, 1).mT
+
+    whitened = whiten(residual)
+    gram, outer = symmetrize(whitened @ whitened.mT), residual[..., None] * residual[..., None, :]
+    unit, others = torch.eye(d).to(gram), (outer.sum(0) - outer) / (n_demos - 1)
+
+    def under(share: float) -> LeftOut:
+        if share == 1.0:
+            return LeftOut(-0.5 * float(gram.trace()), share, gram.diagonal())
+        factor = torch.linalg.cholesky(share * unit + (1.0 - share) * others)
+        inner = whiten((factor @ residual[..., None])[..., 0])
+        ridge = share * (n_demos - 1) / (1.0 - share)
+        inverse = torch.linalg.inv(gram + ridge * torch.eye(n_demos).to(gram))
+        own = inverse.diagonal()
+        cross = (inner @ whitened.mT).fill_diagonal_(0.0)  # one row a demonstration, without itself
+        solved = cross @ inverse
+        explained = (cross * solved).sum(1) - solved.diagonal().square() / own
+        square = (inner.square().sum(1) - explained) / share
+        # log det of share (I + G / a) over the others
+        log_det = n_steps * d * math.log(share) - (n_demos - 1) * math.log(ridge) + own.log() - torch.logdet(inverse)
+        value = float((factor.diagonal(dim1=-2, dim2=-1).log().sum((1, 2)) - 0.5 * (square + log_det)).sum())
+        return LeftOut(value, share, square)
+
+    best = max(map(under, shares), key=lambda each: each.log_likelihood)
+    # The same for all shares, but not for all kernels.
+    unit_log_det = n_demos * float(root.diagonal(dim1=1, dim2=2).log().sum())
+    return best._replace(log_likelihood=best.log_likelihood - unit_log_det)

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from torch_pbd.linalg import safe_cholesky, symmetrize
-from torch_pbd.movement.time_kernel import TimeKernel, smooth_correlation
+from torch_pbd.linalg import safe_cholesky
+from torch_pbd.movement.time_kernel import TimeKernel, left_out, smooth_correlation
 
 # Candidate length scales in ranges of the time, from the spacing of fifty steps to a movement that bends once, and
 # candidate nuggets shared by all steps.
@@ -32,6 +32,12 @@ _ROUNDS = 3  # alternations of nuggets and length scale, which depend on each ot
 _CLEARLY = 10.0
 # Outputs are sorted in steps of this factor of their squared second differences, counted from the smoothest one's.
 _ROUGHER = 4.0
+FEWEST_DF = 3.0
+"""Least degrees of freedom of a movement, whose variance must exist."""
+
+_N_DF = 40  # candidates between the most and the fewest
+_FITS = 2  # of the time kernel: the second one weighs demonstrations whose sizes differ
+_EVEN = 30.0  # degrees of freedom from which sizes differ too little, by 13 %, to fit the kernel again
 _SHARES = (1.0, 0.9, 0.75, 0.6, 0.45, 0.3, 0.2, 0.1, 0.05)  # candidate weights of the kernel in the correlation
 
 
@@ -45,14 +51,6 @@ class Found(NamedTuple):
     log_likelihood: float
     scales: Scales
     nugget: float
-
-
-class LeftOut(NamedTuple):
-    """Highest log likelihood of demonstrations left out in turn, its share, and their squared distances under it."""
-
-    log_likelihood: float
-    share: float
-    square: Float[Tensor, " K"]
 
 
 class Start(NamedTuple):
@@ -85,14 +83,52 @@ def fit_time_kernel(
     other = max(kernels, key=lambda name: sum(start.log_likelihood for start in starts[name]))
     shares = _SHARES if share is None else (share,)
     whole = _fit_outputs(outputs, usual, starts[usual], shares)
-    left_out = _left_out(whole, shares)
+    judged = left_out(whole, shares)
     if other != usual:
         instead = _fit_outputs(outputs, other, starts[other], shares)
-        its_own = _left_out(instead, shares)
-        if its_own.log_likelihood > left_out.log_likelihood + _CLEARLY * len(residual):
-            whole, left_out = instead, its_own
-    whole.share.fill_(left_out.share)
-    return whole, left_out.square
+        its_own = left_out(instead, shares)
+        if its_own.log_likelihood > judged.log_likelihood + _CLEARLY * len(residual):
+            whole, judged = instead, its_own
+    whole.share.fill_(judged.share)
+    return whole, judged.square
+
+
+def fit_weighted(
+    grid: Float[Tensor, " T"],
+    residual: Float[Tensor, "K T d"],
+    deviation: Float[Tensor, "T d"],
+    kernels: Sequence[str],
+    share: float | None,
+    most: float,
+    *,
+    is_even: bool,
+) -> tuple[TimeKernel, float]:
+    """Time kernel as of :func:`fit_time_kernel`, and a movement's degrees of freedom: ``most`` where sizes are even."""
+    size, weight = (~residual.isnan()).sum((1, 2)), residual.new_ones(len(residual))
+    for _ in range(_FITS):
+        weighted = weight[:, None, None] * residual
+        found, square = fit_time_kernel(grid, weighted, deviation, kernels, share)
+        # The kernel is that of weighted residuals over their rms; these are the squares of the unweighted ones.
+        square = square * weighted.square().nanmean() / (weight.square() * residual.square().nanmean())
+        df = most if is_even else movement_df(square, size, most)
+        if df >= min(most, _EVEN):
+            break
+        # Expectation maximization of Student's t: each demonstration counts by the expected inverse square of its size,
+        # so that large and restless ones do not make draws of all too long and too rough.
+        weight = ((df + size) / (df - 2.0 + square)).sqrt()
+    return found, df
+
+
+def movement_df(square: Float[Tensor, " K"], size: Int64[Tensor, " K"], most: float) -> float:
+    """Degrees of freedom, at most ``most``, under which left-out demonstrations of this square and size are likeliest.
+
+    The covariance is the same under all. The few whose marginals were learned from them too differ less in size than a
+    new one does, so that this can tell of fewer degrees of freedom than others do, not of more.
+    """
+    df = most * (FEWEST_DF / most) ** torch.linspace(0.0, 1.0, _N_DF, dtype=torch.float64)[:, None]
+    value = torch.lgamma(0.5 * (df + size)) - torch.lgamma(0.5 * df) - 0.5 * size * (df - 2.0).log()
+    value = value - 0.5 * (df + size) * torch.log1p(square / (df - 2.0))
+    return float(df[value.sum(1).argmax()])
 
 
 def _fit_outputs(
@@ -103,7 +139,7 @@ def _fit_outputs(
     for output, start in zip(outputs, starts, strict=True):
         # A tremor that makes the residuals of one output likelier need not do so jointly with those of the others.
         results = [output.fit(kernel, start, is_sum) for is_sum in (False, True)]
-        fitted.append(max(results, key=lambda result: _left_out(result, shares).log_likelihood))
+        fitted.append(max(results, key=lambda result: left_out(result, shares).log_likelihood))
     stacked = {name: torch.cat([getattr(each, name) for each in fitted]) for name in ("scales", "fine", "nugget")}
     filled = torch.cat([each.residual for each in fitted], dim=2)
     return TimeKernel(kernel, grid=outputs[0].grid, **stacked, residual=filled, share=filled.new_ones(()))
@@ -244,51 +280,6 @@ def _log_likelihood(covariance: Float[Tensor, "b n n"], residual: Float[Tensor, 
         value = -0.5 * whitened.square().sum((1, 2)) - rows.shape[1] * root.diagonal(dim1=1, dim2=2).log().sum(1)
         total += torch.where((info == 0) & torch.isfinite(value), value, -torch.inf)
     return total
-
-
-def _left_out(kernel: TimeKernel, shares: Sequence[float]) -> LeftOut:
-    """Highest log likelihood of the demonstrations, each under the law of the others' residuals.
-
-    In this law ``z = C^-1 y``, y has the covariance ``S = share R + (1 - share) / (K - 1) sum z z'`` over the
-    others, and ``C_t = chol S_tt`` keeps the marginals: it bends the smooth part, at a cost where that has little
-    variance. With the Gram matrix G of all under R^-1, ``M = G + a I``, ``a = share (K - 1) / (1 - share)`` and
-    ``c = Z' R^-1 y``, the squared distance is ``(y' R^-1 y - c' M^-1 c) / share`` and the determinant that of M over
-    the others, whose inverse follows from that of all by removing one row.
-    """
-    n_demos, n_steps, d = kernel.residual.shape
-    if n_demos < 3:  # a single other demonstration has no covariance
-        return LeftOut(0.0, shares[0], kernel.residual.square().sum((1, 2)))
-    root = safe_cholesky(kernel.correlation(kernel.grid, kernel.grid), name="the correlation along the movement")
-    residual = kernel.residual
-
-    def whiten(rows: Float[Tensor, "K T d"]) -> Float[Tensor, "K s"]:
-        return torch.linalg.solve_triangular(root, rows.permute(2, 1, 0), upper=False).flatten(0, 1).mT
-
-    whitened = whiten(residual)
-    gram, outer = symmetrize(whitened @ whitened.mT), residual[..., None] * residual[..., None, :]
-    unit, others = torch.eye(d).to(gram), (outer.sum(0) - outer) / (n_demos - 1)
-
-    def left_out(share: float) -> LeftOut:
-        if share == 1.0:
-            return LeftOut(-0.5 * float(gram.trace()), share, gram.diagonal())
-        factor = torch.linalg.cholesky(share * unit + (1.0 - share) * others)
-        inner = whiten((factor @ residual[..., None])[..., 0])
-        ridge = share * (n_demos - 1) / (1.0 - share)
-        inverse = torch.linalg.inv(gram + ridge * torch.eye(n_demos).to(gram))
-        own = inverse.diagonal()
-        cross = (inner @ whitened.mT).fill_diagonal_(0.0)  # one row a demonstration, without itself
-        solved = cross @ inverse
-        explained = (cross * solved).sum(1) - solved.diagonal().square() / own
-        square = (inner.square().sum(1) - explained) / share
-        # log det of share (I + G / a) over the others
-        log_det = n_steps * d * math.log(share) - (n_demos - 1) * math.log(ridge) + own.log() - torch.logdet(inverse)
-        value = float((factor.diagonal(dim1=-2, dim2=-1).log().sum((1, 2)) - 0.5 * (square + log_det)).sum())
-        return LeftOut(value, share, square)
-
-    best = max(map(left_out, shares), key=lambda each: each.log_likelihood)
-    # The same for all shares, but not for all kernels.
-    unit_log_det = n_demos * float(root.diagonal(dim1=1, dim2=2).log().sum())
-    return best._replace(log_likelihood=best.log_likelihood - unit_log_det)
 
 
 def _by_pattern(residual: Float[Tensor, "K T"]) -> list[tuple[Tensor, Tensor]]:

@@ -22,16 +22,13 @@ from torch_pbd.linalg import safe_cholesky
 from torch_pbd.movement.joint import JointNormal
 from torch_pbd.movement.law import as_rows, check_arrays
 from torch_pbd.movement.time_kernel import TimeKernel
-from torch_pbd.movement.time_kernel_fit import fit_time_kernel, smoothest_first
+from torch_pbd.movement.time_kernel_fit import FEWEST_DF, fit_weighted, smoothest_first
 from torch_pbd.movement.timed import TimedMovement, n_grid_steps, sampled
 
-_FEWEST_DF, _MOST_DF = 3.0, 200.0  # bounds of the joint law's df: its variance must exist; above 200 it is normal
+_MOST_DF = 200.0  # of the joint law: above it is normal
 # Ratio of a row's degrees of freedom to a movement's: only the few demonstrations show how unusual a whole one can be,
 # while a row is also seen in its neighbours. 1, 1.5, 2, 3 and 4 were tried on half of the recorded sets.
 _WHOLE = 2.0
-_N_DF = 40  # candidates between the most and the fewest
-_ROUNDS = 2  # fits of the time kernel: the second one weighs demonstrations whose sizes differ
-_EVEN = 30.0  # degrees of freedom from which sizes differ too little, by 13 %, to fit the kernel again
 
 
 class TrajectoryLaw(nn.Module):
@@ -91,18 +88,6 @@ class TrajectoryLaw(nn.Module):
 def root_in_order(covariance: Float[Tensor, "n d d"], order: Int64[Tensor, " d"]) -> Float[Tensor, "n d d"]:
     """Roots of covariances, whose column k is what output ``order[k]`` has beyond those before it."""
     return safe_cholesky(covariance[:, order][:, :, order], name="the covariance at a step")[:, order.argsort()]
-
-
-def movement_df(square: Float[Tensor, " K"], size: Int64[Tensor, " K"], most: float) -> float:
-    """Degrees of freedom, at most ``most``, under which left-out demonstrations of this square and size are likeliest.
-
-    The covariance is the same under all. The few whose marginals were learned from them too differ less in size than a
-    new one does, so that this can tell of fewer degrees of freedom than others do, not of more.
-    """
-    df = most * (_FEWEST_DF / most) ** torch.linspace(0.0, 1.0, _N_DF, dtype=torch.float64)[:, None]
-    value = torch.lgamma(0.5 * (df + size)) - torch.lgamma(0.5 * df) - 0.5 * size * (df - 2.0).log()
-    value = value - 0.5 * (df + size) * torch.log1p(square / (df - 2.0))
-    return float(df[value.sum(1).argmax()])
 
 
 @dataclass(eq=False, repr=False)
@@ -174,7 +159,7 @@ class TrajectoryRegressor(TimedMovement):
     random_state: Any = 0
 
     _learned: ClassVar[Any] = {
-        "df_": partial(checks.number, least=_FEWEST_DF, most=_MOST_DF),
+        "df_": partial(checks.number, least=FEWEST_DF, most=_MOST_DF),
         "time_kernel_": partial(checks.choice, choices=tuple(KERNELS)),
     }
 
@@ -214,20 +199,10 @@ class TrajectoryRegressor(TimedMovement):
         share = None if self.shrinkage == "auto" else 1.0 - float(self.shrinkage)
         scaled, deviation = torch.from_numpy((grid - low) / width), root[:, order].diagonal(dim1=1, dim2=2)
         degrees = np.median(self.regressor_.predict_df(grid[:, np.newaxis]))
-        most = float(np.clip(degrees / _WHOLE, _FEWEST_DF, _MOST_DF))
-        size, weight = (~whitened.isnan()).sum((1, 2)), whitened.new_ones(len(whitened))
-        for _ in range(_ROUNDS):
-            weighted = weight[:, None, None] * whitened
-            found, square = fit_time_kernel(scaled, weighted, deviation, kernels, share)
-            # The kernel is that of weighted residuals over their rms; these are the squares of the unweighted ones.
-            square = square * weighted.square().nanmean() / (weight.square() * whitened.square().nanmean())
-            # Wide tails would blur the phase of a movement of unknown timing.
-            self.df_ = movement_df(square, size, most) if self._timing is None else most
-            if self.df_ >= min(most, _EVEN):
-                break
-            # Expectation maximization of Student's t: each demonstration counts by the expected inverse square of its
-            # size, so that large and restless ones do not make draws of all too long and too rough.
-            weight = ((self.df_ + size) / (self.df_ - 2.0 + square)).sqrt()
+        most = float(np.clip(degrees / _WHOLE, FEWEST_DF, _MOST_DF))
+        # Wide tails would blur the phase of a movement of unknown timing.
+        is_even = self._timing is not None
+        found, self.df_ = fit_weighted(scaled, whitened, deviation, kernels, share, most, is_even=is_even)
         self._set_law(found, order)
         self.time_kernel_ = found.kernel
 
