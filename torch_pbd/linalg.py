@@ -93,7 +93,7 @@ def scale_tril_from_root(root: Float[Tensor, "*b d r"]) -> Float[Tensor, "*b d d
     if rank < n_outputs:
         root = torch.cat([root, root.new_zeros(*root.shape[:-1], n_outputs - rank)], dim=-1)
     # The decomposition leaves the signs of the rows of R open.
-    upper = torch.linalg.qr(root.mT, mode="reduced" if torch.is_grad_enabled() else "r").R  # "r" has no gradient
+    upper = torch.linalg.qr(root.mT).R
     sign = torch.where(upper.diagonal(dim1=-2, dim2=-1) < 0, -1.0, 1.0).to(upper)
     return (sign.unsqueeze(-1) * upper).mT
 

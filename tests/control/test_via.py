@@ -206,11 +206,52 @@ def test_what_a_controller_was_conditioned_on_stays_where_goal_and_start_are_oth
         at_ends = known.schedule(rate=100.0).position[[0, -1]]
         expected = [ends.get("start", at_ends[0]), ends.get("goal", at_ends[1])]
         np.testing.assert_allclose(moved.position[[0, -1]], expected, rtol=0, atol=1e-9)
-    with pytest.raises(ValueError, match=r"y0 of via\[0\] is .* as of what is known at 1 s, which is at the same time"):
+    with pytest.raises(ValueError, match=r"y0 of via\[0\] is .* as of what is known, which is at the same time"):
         known.schedule(rate=100.0, via=[(1.0, where + 0.1)])
     about = controller.condition([2.0], [controller.goal_ + 0.01], noise_scale=0.01)
     goal = controller.goal_ + 0.02
     np.testing.assert_allclose(about.schedule(rate=100.0, goal=goal).position[-1], goal, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("model", [TrajectoryRegressor(), ProMPBaseline()])
+def test_outputs_are_known_one_by_one_at_one_time(model):
+    controller = DMPController(model).fit(demonstrations())
+    where = controller.predict([[1.0]])[0] + [0.02, 0.01]
+    known = controller.condition([1.0], [[np.nan, where[1]]])
+    both = known.condition([1.0], [[where[0], np.nan]])
+    for bent, options in (
+        (known, {"via": [(1.0, [where[0], np.nan])]}),
+        (both, {}),
+        (both, {"goal": controller.goal_ + 0.1}),
+    ):
+        np.testing.assert_allclose(bent.schedule(rate=100.0, **options).position[100], where, rtol=0, atol=1e-9)
+    end = known.condition([2.0], [[np.nan, controller.goal_[1] + 0.002]])
+    goal = [controller.goal_[0] + 0.003, end.schedule(rate=100.0).position[-1, 1]]
+    np.testing.assert_allclose(end.schedule(rate=100.0, goal=goal).position[-1], goal, rtol=0, atol=1e-9)
+    with pytest.raises(ValueError, match=r"y1 of via\[0\] is .* as of what is known"):
+        known.schedule(rate=100.0, via=[(1.0, where + 0.05)])
+
+
+@pytest.mark.filterwarnings("ignore:via")
+def test_the_order_in_which_points_are_given_does_not_matter(controller):
+    via = [(at, controller.predict([[at]])[0] + [0.05, 0.0]) for at in (0.6, 1.0, 1.4)]
+    paths = [controller.schedule(rate=100.0, via=[via[i] for i in order]).position for order in ((0, 1, 2), (2, 0, 1))]
+    np.testing.assert_array_equal(*paths)
+
+
+@pytest.mark.filterwarnings("ignore:The reproduced movement is .* off the mean")
+@pytest.mark.parametrize(("options", "atol"), [({"adaptation": "additive"}, 1e-6), ({"phase_input": "s"}, 1e-9)])
+def test_own_ends_change_nothing_and_what_is_known_stays_in_any_form_of_movement(options, atol):
+    controller = DMPController(ProMPBaseline(), **options).fit(demonstrations())
+    plain = controller.schedule(rate=100.0)
+    own = controller.schedule(rate=100.0, goal=controller.goal_, start=controller.start_)
+    np.testing.assert_allclose(own.position, plain.position, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(own.stiffness, plain.stiffness, rtol=1e-9)
+    where = controller.predict([[1.0]])[0] + [0.02, 0.01]
+    known = controller.condition([1.0], [where])
+    known = known.condition([1.2], known.predict([[1.2]]) + 0.002)
+    moved = known.schedule(rate=100.0, start=controller.start_ + 0.05)
+    np.testing.assert_allclose(moved.position[100], where, rtol=0, atol=atol)
 
 
 def test_a_movement_that_was_pushed_goes_on_from_where_it_is(controller):

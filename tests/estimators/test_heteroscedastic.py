@@ -195,6 +195,15 @@ def test_where_all_were_rounded_to_one_value_nothing_is_certain(seed):
     assert np.median(rms) == pytest.approx(1.0, abs=0.2)
 
 
+def test_noise_around_levels_is_no_rounding():
+    """Thirty levels, passed at the same times, with noise of a thousandth of a step."""
+    s, rng = np.linspace(0.0, 1.0, 60), np.random.default_rng(1)
+    y = np.tile(np.floor(30.0 * s), 5) + 1e-3 * rng.standard_normal(300)
+    beside = np.tile(np.sin(6.0 * s), 5) + 0.01 * rng.standard_normal(300)
+    model = HeteroscedasticGPRegressor().fit(np.tile(s, 5)[:, None], np.c_[y, beside], np.repeat(np.arange(5), 60))
+    assert np.median(model.predict(s[:, None], return_std=True)[1][:, 0]) < 0.02
+
+
 def test_values_that_are_multiples_of_a_step_by_themselves_are_not_rounded():
     """At a constant speed y is a multiple of the way in a step, of which it is no rounding."""
     steps = np.tile(np.arange(50.0), 6)

@@ -301,8 +301,8 @@ def test_79_a_loop_that_is_always_too_slow_is_refused_with_its_step():
     for i in (1, 2):
         assert controller.tick(0.011 * i, [5.0]) == TickStatus.LATE
     with pytest.raises(ValueError, match=r"max_step is 0.01 s, must be longer .* all 3 since start .* 0.011 s: give"):
-        controller.tick(0.033, [5.0])
-    assert (controller.position, controller.velocity) == ((0.0,), (0.0,))
+        controller.tick(0.033, [-7.0])
+    assert (controller.position, controller.velocity, controller.force) == ((0.0,), (0.0,), (5.0,))
     controller = one_axis(max_step=0.033)
     controller.start(0.0)
     assert [controller.tick(0.011 * i, [5.0]) for i in range(1, 5)] == [0] * 4

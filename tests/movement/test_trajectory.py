@@ -349,6 +349,23 @@ def test_degrees_of_freedom_are_the_likeliest_of_demonstrations():
         assert value(found) >= max(value(min(most, 1.1 * found)), value(max(3.0, found / 1.1)))
 
 
+@pytest.mark.filterwarnings("ignore:The demonstrations are identical")
+def test_outputs_that_do_not_vary_say_nothing_of_sizes():
+    demos = np.stack([sample_series("matern52", 0.3, 12, seed)[..., 0].numpy() for seed in (1, 2)], axis=2)
+    still = np.concatenate([demos, np.ones_like(demos)], axis=2)
+    found = []
+    for each in (demos, still, np.ones_like(demos) + demos[:1]):
+        X, y, groups = stacked(each)
+        found.append(TrajectoryRegressor(CholeskyCovRegressor()).fit(X, y, groups=groups).df_)
+    assert found[1] == pytest.approx(found[0], rel=0.2)
+    assert found[2] == 200.0  # one movement, shown again and again
+
+
+def test_fewest_degrees_of_freedom_are_those_that_a_file_may_have():
+    square, size = torch.tensor([1e-3, 1e-3, 1e6] * 5).double(), torch.full((15,), 50)
+    assert time_kernel_fit.movement_df(square, size, 10.69069069069069) == 3.0
+
+
 def test_large_demonstrations_widen_the_law_and_do_not_make_draws_of_all_rough(monkeypatch):
     """One in five is four times as far from the others, and trembles: most of a mean square is theirs."""
     demos = np.stack([sample_series("squared_exponential", 0.3, 30, seed)[..., 0].numpy() for seed in (1, 2)], axis=2)

@@ -8,7 +8,8 @@ from rest to rest: the change that they add has no velocity and no acceleration 
 
 import copy
 from collections.abc import Sequence
-from typing import Any
+from operator import attrgetter
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,10 +23,16 @@ from torch_pbd.exceptions import InvalidParameterError
 _N_KNOTS = 200  # knots of a change over a movement, whose length scales are at least a fiftieth of it
 # Standard deviations beyond which nobody deviates: steps of left-out demonstrations were up to 23 away.
 _FAR = 30.0
+_AGREE = 1e-4  # share of the movement's extent by which points at one time may differ: 30 um of 0.3 m
 _LIKELY = 0.95  # share of demonstrations beyond whose deviation a point counts as unlikely
 
-_Points = dict[str, tuple[float, Floats]]
-"""Movement times and outputs of points, NaN where free, by their names in errors."""
+
+class _Point(NamedTuple):
+    """Place (d,) to be at a movement time, NaN where free."""
+
+    name: str
+    at: float
+    place: Floats
 
 
 def can_bend(controller: Any, *, must: bool = False) -> bool:
@@ -94,35 +101,43 @@ def planned(
     if via is None and (not can_bend(controller) or (goal is None and start is None)):
         return controller, goal, start
     can_bend(controller, must=True)
-    duration, motion = controller.duration_, controller.reproduction_.motion
-    ends = {"start": (0.0, start), "goal": (duration, goal)}
-    known, points = _known_points(controller), _checked_points(via, ends, controller)
-    rest, changes, pins = {"start": start, "goal": goal}, {}, []
-    for (name, (at, target)), place in zip(ends.items(), motion(np.array([0.0, duration]))[0], strict=True):
-        if target is not None and target.ndim > 1:
-            continue  # a goal that moves
-        rest[name] = None
-        if target is None or np.allclose(target, place, rtol=checks.ROUNDING, atol=0.0):
-            given = [own for own, _ in [*known.values(), *points.values()]]
-            pins += [at] if (np.abs(np.array(given) - at) > _rounding(controller)).all() else []
-        else:
-            changes[name] = target - place
+    duration, reproduction = controller.duration_, controller.reproduction_
+    known, rest = _known_points(controller), {"start": start, "goal": goal}
+    at_ends, own = {"start": 0.0, "goal": duration}, {"start": controller.start_, "goal": controller.goal_}
+    given = [_Point(name, at_ends[name], aim) for name, aim in rest.items() if aim is not None and aim.ndim == 1]
+    points = _distinct(_checked_points(via, controller), [*known, *given], controller)
+    here = own
+    if len(controller.covariance_._known.time):  # observations, those with noise too, moved the ends of the path
+        here = dict(zip(at_ends, reproduction.motion(np.array([0.0, duration]))[0], strict=True))
+    ends = [end._replace(place=end.place - here[end.name]) for end in _distinct(given, known, controller)]
+    ends = [end for end in ends if (np.abs(end.place) > checks.ROUNDING * _extents(controller)).any()]
+    taken = np.array([point.at for point in (*known, *points, *ends)])
+    rest = {name: aim if aim is not None and aim.ndim > 1 else None for name, aim in rest.items()}  # goals that move
+    still = [at_ends[name] for name, aim in rest.items() if aim is None]
+    pins = [at for at in still if (np.abs(taken - at) > _rounding(controller)).all()]
     likely = _Likely(controller, pins)
-    for name, own in (("start", controller.start_), ("goal", controller.goal_)):
-        if name in changes and (left := likely.add(ends[name][0], changes[name])).any():
-            rest[name] = own + left
-    even, aim = np.linspace(0.0, duration, 2 * controller.n_steps), rest["goal"]
-    aim = aim if aim is None or aim.ndim == 1 else None  # of one that moves nobody knows the path
-    path = CubicSpline(even, controller.reproduction_.plan(even, aim, rest["start"], 1.0)[0])
+    for end in ends:
+        if (left := np.nan_to_num(likely.add(end.at, end.place))).any():
+            rest[end.name] = own[end.name] + left
+    path = _path_at([point.at for point in (*known, *points)], controller, rest["goal"], rest["start"])
     # What was known stays, wherever the primitive takes the path.
-    beyond = [(at, position - path(at)) for at, position in known.values() if changes]
-    beyond += [(at, likely.add(at, position - path(at), name)) for name, (at, position) in points.items()]
-    bent = conditioned(
-        controller, np.array(likely.times), np.reshape(likely.changes, (-1, controller.n_outputs_)), pins=pins
-    )
+    beyond = [(at, place - path[at]) for _, at, place in known if ends]
+    beyond += [(at, likely.add(at, place - path[at], name)) for name, at, place in points]
+    changes = np.reshape(likely.changes, (-1, controller.n_outputs_))
+    bent = conditioned(controller, np.array(likely.times), changes, pins=pins)
     bend = bent.reproduction_.bend
     bent.reproduction_.bend = CubicSpline(bend.x, bend(bend.x) + _rest_to_rest(controller, beyond, bend.x))
     return bent, rest["goal"], rest["start"]
+
+
+def _path_at(times: list[float], controller: Any, goal: Floats | None, start: Floats | None) -> dict[float, Floats]:
+    """Places (d,) of the primitive, to another goal from another start, at movement times."""
+    grid, plan = np.unique([0.0, *times]), controller.reproduction_.plan
+    goal = goal if goal is None or goal.ndim == 1 else None  # of one that moves nobody knows the path
+    if controller.adaptation == "safe" or (goal is None and start is None):
+        return dict(zip(grid.tolist(), plan(grid, goal, start, 1.0)[0], strict=True))
+    even = np.linspace(0.0, controller.duration_, 20 * controller.n_steps)  # the equation is solved tick by tick
+    return dict(zip(grid.tolist(), CubicSpline(even, plan(even, goal, start, 1.0)[0])(grid), strict=True))
 
 
 class _Likely:
@@ -186,13 +201,17 @@ def _rounding(controller: Any) -> float:
     return checks.ROUNDING * float(controller.duration_)
 
 
-def _checked_points(via: Any, ends: dict[str, tuple[float, Floats | None]], controller: Any) -> _Points:
-    """Via points, those at one time as one, but for those at given ends or known, which they must agree with."""
+def _extents(controller: Any) -> Floats:
+    """Extent (d,) of the movement in each output, that of all in its unit."""
+    even = np.linspace(0.0, controller.duration_, controller.n_steps)
+    return np.asarray(controller.outputs_.extents(controller.reproduction_.motion(even)[0][np.newaxis]))
+
+
+def _checked_points(via: Any, controller: Any) -> list[_Point]:
+    """Via points, in the order of their times."""
     if via is not None and not np.iterable(via):
         raise checks.refusal(via, "via", "a list of pairs, each a time in s and a position")
-    fixed = _known_points(controller)
-    fixed |= {name: (at, end) for name, (at, end) in ends.items() if end is not None and end.ndim == 1}
-    points = dict(fixed)
+    points = []
     for number, point in enumerate(() if via is None else via):
         try:
             at, position = point
@@ -203,34 +222,39 @@ def _checked_points(via: Any, ends: dict[str, tuple[float, Floats | None]], cont
         position = controller.outputs_.rows(position, name)
         if position.shape != (n_outputs,) or np.isinf(position).any() or np.isnan(position).all():
             raise checks.refusal(position.tolist(), name, f"{n_outputs} numbers, NaN where free")
-        points[f"via[{number}]"] = at, position
-    joined = _one_each_time(points, controller)
-    return {name: point for name, point in joined.items() if name not in fixed}
+        points.append(_Point(f"via[{number}]", at, position))
+    return sorted(points, key=attrgetter("at"))
 
 
-def _known_points(controller: Any) -> _Points:
-    """Points that a conditioned controller knows without noise: where it is there."""
+def _known_points(controller: Any) -> list[_Point]:
+    """What a conditioned controller knows without noise: where it is there."""
     known, reproduction = controller.covariance_._known, controller.reproduction_
     times = reproduction.time_of(known.time)
-    rows = zip(times, known.exact.reshape(-1, controller.n_outputs_), reproduction.motion(times)[0], strict=True)
-    return {
-        f"what is known at {at:g} s": (at, np.where(exact, place, np.nan)) for at, exact, place in rows if exact.any()
-    }
+    rows = zip(
+        times.tolist(), known.exact.reshape(-1, controller.n_outputs_), reproduction.motion(times)[0], strict=True
+    )
+    return [_Point("what is known", at, np.where(exact, place, np.nan)) for at, exact, place in rows if exact.any()]
 
 
-def _one_each_time(points: _Points, controller: Any) -> _Points:
-    """Points, those at one time as one, which is likely or not as a whole."""
-    joined: _Points = {}
-    for name, (at, position) in points.items():
-        first = next((i for i, (own, _) in joined.items() if abs(at - own) <= _rounding(controller)), name)
-        at, own = joined.get(first, (at, position))
-        rounding = checks.ROUNDING * np.nanmax(np.abs(own))
-        differs = np.abs(position - own) > rounding  # not where either is NaN
-        if differs.any():
-            output = int(differs.argmax())
-            raise InvalidParameterError(
-                f"{controller.names_[output]} of {name} is {position[output]:.10g}, must be {own[output]:.10g} as of "
-                f"{first}, which is at the same time, {at:g} s: leave one of them out."
-            )
-        joined[first] = at, np.where(np.isnan(own), position, own)
-    return joined
+def _distinct(given: list[_Point], fixed: list[_Point], controller: Any) -> list[_Point]:
+    """Points given, those at one time as one, and free where others are ``fixed``, with which they must agree."""
+    tolerance, result = _AGREE * _extents(controller), list[_Point]()
+    for name, at, place in given:
+        for other in (*fixed, *result):
+            if abs(at - other.at) > _rounding(controller):
+                continue
+            differs = np.abs(place - other.place) > tolerance  # not where either is NaN
+            if differs.any():
+                output = int(differs.argmax())
+                raise InvalidParameterError(
+                    f"{controller.names_[output]} of {name} is {place[output]:.10g}, must be "
+                    f"{other.place[output]:.10g} as of {other.name}, which is at the same time, {at:g} s: leave one of "
+                    "them out."
+                )
+            place = np.where(np.isnan(other.place), place, np.nan)
+        twin = next((i for i, other in enumerate(result) if abs(at - other.at) <= _rounding(controller)), None)
+        if twin is not None:
+            result[twin] = result[twin]._replace(place=np.where(np.isnan(place), result[twin].place, place))
+        elif not np.isnan(place).all():
+            result.append(_Point(name, at, place))
+    return result

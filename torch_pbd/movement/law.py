@@ -35,6 +35,16 @@ class Known(NamedTuple):
         pairs = zip(self, other, strict=True)
         return Known(*(np.concatenate([own.reshape(-1, *new.shape[1:]), new]) for own, new in pairs))
 
+    def joined(self, rounded: Floats) -> "Known":
+        """Those at one of the ``rounded`` times as one, if no entry is given twice: known one by one, all are known."""
+        _, first, place = np.unique(rounded, return_index=True, return_inverse=True)
+        rows, outputs = (~np.isnan(self.value)).nonzero()
+        if len(first) == len(rounded) or len(np.unique(np.stack([place[rows], outputs]), axis=1).T) < len(rows):
+            return self
+        value, noise = np.full((len(first), self.value.shape[1]), np.nan), np.zeros((len(first), self.value.shape[1]))
+        value[place[rows], outputs], noise[place[rows], outputs] = self.value[rows, outputs], self.noise[rows, outputs]
+        return Known(self.time[first], value, noise)
+
     @property
     def exact(self) -> NDArray[np.bool_]:
         """Entries (m, d) that are given without noise."""
@@ -120,7 +130,8 @@ class MovementLaw(BaseEstimator, ABC):
         checks.require((scale >= 0.0) & np.isfinite(scale), scale, "noise_scale", "a finite number of at least 0")
         some = ~np.isnan(value).all(axis=1)
         copied = self._copy()
-        copied._known = known = self._known.and_also(time[some], value[some], np.broadcast_to(scale, value[some].shape))
+        known = self._known.and_also(time[some], value[some], np.broadcast_to(scale, value[some].shape))
+        copied._known = known = known.joined(self._rounded(known.time))
         rows, outputs = known.exact.nonzero()
         if len(set(zip(self._rounded(known.time)[rows], outputs, strict=True))) < len(rows):
             raise ValueError("X has a time that is given twice, or is known already, without noise: leave it out.")

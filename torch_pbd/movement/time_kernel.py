@@ -96,7 +96,10 @@ def _interpolated(grid: Float[Tensor, " T"], values: Float[Tensor, "*c T"], time
 
 
 class LeftOut(NamedTuple):
-    """Highest log likelihood of demonstrations left out in turn, its share, and their squared distances under it."""
+    """Highest log likelihood of demonstrations left out in turn, its share, and their squared distances under it.
+
+    Two demonstrations have no others to be judged by: their squares are of residuals.
+    """
 
     log_likelihood: float
     share: float

@@ -16,7 +16,7 @@ from torch_pbd.movement.time_kernel import TimeKernel, left_out, smooth_correlat
 # Candidate length scales in ranges of the time, from the spacing of fifty steps to a movement that bends once, and
 # candidate nuggets shared by all steps.
 _LENGTHS = torch.logspace(math.log10(0.02), 0.0, 14, dtype=torch.float64).tolist()
-# Factors from the one before to the next of these: smooth laws are a third of their divergence farther without.
+# Factors from the one before to the next of these, at their ends too: smooth laws are a third farther without.
 _BETWEEN = [(_LENGTHS[1] / _LENGTHS[0]) ** (step / 6.0) for step in range(-6, 7)]
 _NUGGETS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1)
 _FINE_WEIGHTS = (0.03, 0.1, 0.3, 0.6)  # candidate shares of the tremor in the variance at a usual step
@@ -35,6 +35,7 @@ _ROUGHER = 4.0
 FEWEST_DF = 3.0
 """Least degrees of freedom of a movement, whose variance must exist."""
 
+_STILL = 1e-3  # rms of residuals, over their predicted deviation, of an output that does not vary
 _N_DF = 40  # candidates between the most and the fewest
 _FITS = 2  # of the time kernel: the second one weighs demonstrations whose sizes differ
 _EVEN = 30.0  # degrees of freedom from which sizes differ too little, by 13 %, to fit the kernel again
@@ -104,11 +105,14 @@ def fit_weighted(
     is_even: bool,
 ) -> tuple[TimeKernel, float]:
     """Time kernel as of :func:`fit_time_kernel`, and a movement's degrees of freedom: ``most`` where sizes are even."""
-    size, weight = (~residual.isnan()).sum((1, 2)), residual.new_ones(len(residual))
+    # Of an output that does not vary, rounding is left: it says nothing of sizes.
+    varies = residual.square().nanmean((0, 1)) > _STILL**2
+    residual = torch.where(varies, residual, 0.0 * residual)
+    size, weight = (~residual[..., varies].isnan()).sum((1, 2)), residual.new_ones(len(residual))
     for _ in range(_FITS):
         weighted = weight[:, None, None] * residual
         found, square = fit_time_kernel(grid, weighted, deviation, kernels, share)
-        # The kernel is that of weighted residuals over their rms; these are the squares of the unweighted ones.
+        # The kernel is of weighted residuals, each output's over its rms; these are about the unweighted ones' squares.
         square = square * weighted.square().nanmean() / (weight.square() * residual.square().nanmean())
         df = most if is_even else movement_df(square, size, most)
         if df >= min(most, _EVEN):
@@ -128,7 +132,7 @@ def movement_df(square: Float[Tensor, " K"], size: Int64[Tensor, " K"], most: fl
     df = most * (FEWEST_DF / most) ** torch.linspace(0.0, 1.0, _N_DF, dtype=torch.float64)[:, None]
     value = torch.lgamma(0.5 * (df + size)) - torch.lgamma(0.5 * df) - 0.5 * size * (df - 2.0).log()
     value = value - 0.5 * (df + size) * torch.log1p(square / (df - 2.0))
-    return float(df[value.sum(1).argmax()])
+    return max(FEWEST_DF, float(df[value.sum(1).argmax()]))
 
 
 def _fit_outputs(

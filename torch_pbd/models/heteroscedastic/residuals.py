@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
+from torch_pbd.checks import ROUNDING
 from torch_pbd.linalg import safe_cholesky, triangular_inverse
 from torch_pbd.models.heteroscedastic.whitening import NoiseCorrelation, bidiagonal
 from torch_pbd.models.training import TrainingSet
@@ -35,9 +36,9 @@ _SHARE_OF_THIRD = 0.433  # independent ones among third differences of white noi
 _CONSTANT = 1e-20  # variance of an output that does not vary
 _LEAST = 1e-300  # a divisor that is zero gives zero and not NaN
 
-# Differences below this share of an output's largest value are rounding. So many others, all multiples of the least to
-# within so much of it (float32), are no chance: once in 10^15. The two states of a gripper are too few.
-_SAME, _FEWEST_STEPS, _OFF_STEP = 1e-12, 15, 0.05
+# Differences below this share of an output's largest value are rounding, as of other units. So many others, multiples of
+# the least to within so much of it (float32), are no chance: once in 10^15. The two states of a gripper are too few.
+_SAME, _FEWEST_STEPS, _OFF_STEP = ROUNDING, 15, 0.05
 
 _N_BINS = 50  # bins of the distance between samples, up to the range of the inputs
 _MAX_SAMPLES = 400  # most samples used of one demonstration; longer ones are thinned
@@ -118,24 +119,15 @@ def _too_smooth(training: TrainingSet) -> Bool[Tensor, " d"]:
 
 
 def quantum(y: Float[Tensor, "rows d"]) -> Float[Tensor, " d"]:
-    """Step of which the values of each output are multiples, as encoders and pixels give them; zero if of none.
-
-    Of multiples that later arithmetic has rounded, as of other units, the differences are of two sizes: those between
-    equal ones are far below the least of the others.
-    """
-    steps = torch.zeros_like(y[0])
-    for output, values in enumerate(y.mT):
-        difference = values.unique().diff().sort().values
+    """Step of which the values of each output are multiples, as encoders and pixels give them; zero if of none."""
+    steps = []
+    for values in y.mT:
+        difference = values.unique().diff()
         difference = difference[difference > _SAME * values.abs().max()]
-        rises = (difference[:-1] < _OFF_STEP * difference[1:]).nonzero().flatten() + 1
-        for start in (0, *rises.tolist()):
-            larger = difference[start:]
-            step = larger[larger < 1.5 * larger[:1]].mean()
-            multiple = larger / step
-            if len(larger) >= _FEWEST_STEPS and bool(((multiple - multiple.round()).abs() < _OFF_STEP).all()):
-                steps[output] = step
-                break
-    return steps
+        step = float(difference.min()) if len(difference) >= _FEWEST_STEPS else 0.0
+        multiple = difference / step
+        steps.append(step if bool(((multiple - multiple.round()).abs() < _OFF_STEP).all()) else 0.0)
+    return torch.tensor(steps).to(y)
 
 
 @dataclass(frozen=True)
