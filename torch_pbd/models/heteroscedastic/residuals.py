@@ -36,8 +36,8 @@ _SHARE_OF_THIRD = 0.433  # independent ones among third differences of white noi
 _CONSTANT = 1e-20  # variance of an output that does not vary
 _LEAST = 1e-300  # a divisor that is zero gives zero and not NaN
 
-# Differences below this share of an output's largest value are rounding, as of other units. So many others, multiples of
-# the least to within so much of it (float32), are no chance: once in 10^15. The two states of a gripper are too few.
+# Differences below this share of an output's largest value are rounding, as of other units. So many others, all of them
+# multiples of the least to within so much of it, are no chance: once in 10^15. Two states of a gripper are too few.
 _SAME, _FEWEST_STEPS, _OFF_STEP = ROUNDING, 15, 0.05
 
 _N_BINS = 50  # bins of the distance between samples, up to the range of the inputs
