@@ -291,6 +291,16 @@ def test_a_movement_whose_start_is_known_still_meets_its_via_points(controller):
     np.testing.assert_allclose(bent.position[[0, 100]], [controller.start_, [0.22, 0.13]], atol=1e-3)
 
 
+def test_what_is_known_exactly_of_an_output_beside_a_precise_one_has_no_variance():
+    # The tunnel's y varies a billion times less than its x: rounding of the variance of x is much beside it.
+    controller = DMPController(TrajectoryRegressor()).fit(make_tunnel_demonstrations(random_state=0))
+    place = controller.predict([[3.0], [6.0]])
+    via = [(3.0, np.add(place[0], [0.01, np.nan])), (6.0, np.add(place[1], [0.02, 0.0]))]
+    bent = controller.schedule(rate=200.0, via=via, goal=np.add(controller.goal_, [0.05, 0.0]))
+    np.testing.assert_allclose(bent.position[600, 0], via[0][1][0], atol=1e-6)
+    assert (np.linalg.eigvalsh(bent.covariance[600]) >= 0.0).all()
+
+
 def test_any_model_of_movements_bends(controller):
     other = DMPController(ProMPBaseline()).fit(demonstrations())
     bent = other.schedule(rate=100.0, via=[(1.0, [0.22, 0.13])])

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torch_pbd.linalg import safe_cholesky, symmetrize
+from torch_pbd.linalg import safe_cholesky, spectral_map, symmetrize
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,11 @@ class JointNormal:
         variance = variance - self.taken.square().sum(2)
         inner = self.loadings @ self.loadings.mT
         inner.diagonal(dim1=1, dim2=2).add_(variance.mT)
-        return symmetrize(self.factor @ inner @ self.factor.mT - self.explained @ self.explained.mT)
+        whole = symmetrize(self.factor @ inner @ self.factor.mT - self.explained @ self.explained.mT)
+        # Rounding may leave less than nothing of the variance of what was observed exactly.
+        singular = torch.linalg.cholesky_ex(whole).info > 0
+        whole[singular] = spectral_map(whole[singular], lambda variance: variance.clamp_min(0.0))
+        return whole
 
     def log_density(self, x: Float[Tensor, "n d"], df: float) -> float:
         """Log density of a movement under Student's t of this covariance, or the normal law for infinite ``df``."""
