@@ -214,7 +214,8 @@ class _ActiveRateLimit(ActiveFilter):
         if not rise.any():
             return ones
         last_stiffness, last_damping, last_mass, step = self._tick
-        d, change = rise.shape[-1], tick_change(*self._tick)
+        d, rate = rise.shape[-1], admittance_rate(last_stiffness, last_damping, last_mass)
+        change = expm1(step * rate[..., : 2 * d, :])  # from deviation, velocity and held force to that of the first two
         unit = library.eye(3 * d, dtype=rise.dtype, device=rise.device)
         start, forces = unit[: 2 * d], unit[2 * d :]
         # The equation of motion integrated over the tick, M dv = f h - K int(y) - D dy, gives int(y), of which the port
@@ -255,11 +256,6 @@ def admittance_rate(stiffness: Array, damping: Array, mass: Array) -> Array:
     rate[..., :d, d : 2 * d] = library.eye(d)
     rate[..., d : 2 * d, :] = library.concatenate([-inverse @ stiffness, -inverse @ damping, inverse], axis=-1)
     return rate
-
-
-def tick_change(stiffness: Array, damping: Array, mass: Array, step: float) -> Array:
-    """Matrix (..., 2 d, 3 d) from deviation, velocity and held force to the change of the first two over a tick."""
-    return expm1(step * admittance_rate(stiffness, damping, mass)[..., : 2 * stiffness.shape[-1], :])
 
 
 def expm1(matrix: Array) -> Array:

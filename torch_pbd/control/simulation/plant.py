@@ -180,9 +180,6 @@ class AdmittancePlant:
         """Task of this plant from checked arguments of :meth:`simulate`, the times of ticks and a schedule's mass."""
         mass = self.mass(times) if callable(self.mass) else own_mass if self.mass is None else self.mass
         mass = mass_rows(1.0 if mass is None else mass, stiffness)
-        stiffness, damping = torch.broadcast_tensors(stiffness, damping)
-        if mass.ndim > 2:
-            stiffness, damping, mass = torch.broadcast_tensors(stiffness, damping, mass)
         inertial = torch.zeros_like(velocity_desired)
         if self.feed_forward:
             if acceleration_desired is None:  # that which takes the velocity of each tick to that of the next
@@ -194,9 +191,9 @@ class AdmittancePlant:
             turns = pad(turns, (0, 0, 0, 1))
             transport = torch.linalg.matrix_exp(rotations.cross_matrix(turns))
             pose, steps = pad(pose, (0, 3)), pad(steps, (0, 3)) + pad(turns, (pose.shape[-1], 0))
-        motions, gains = (pose, velocity_desired, inertial, steps), (stiffness, damping, mass)
-        acting = {name: getattr(self, name) for name in ("substeps", *_PARTS)}
-        return Task(*motions, *gains, dt, **acting, orientation=orientation_desired, transport=transport)
+        motions = pose, velocity_desired, inertial, steps
+        stiffness, damping, mass = torch.broadcast_tensors(stiffness, damping, mass)
+        return Task(*motions, stiffness, damping, mass, dt, self, orientation_desired, transport)
 
 
 def _check(given: dict[str, Tensor]) -> None:

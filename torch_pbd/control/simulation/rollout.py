@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torch_pbd import checks, rotations
-from torch_pbd.control.simulation.ticks import State, Task, mass_at, open_loop, tick_map, tick_maps
+from torch_pbd.control.simulation.ticks import State, Task, open_loop, tick_map, tick_maps
 from torch_pbd.files.memory import require_memory
 from torch_pbd.linalg import broadcast_shapes
 
@@ -115,21 +115,21 @@ class Loop:
     """State (..., d) of a run with sensor, loop, walls and filter, advanced tick by tick."""
 
     def __init__(self, task: Task, state: State, generator: torch.Generator | None) -> None:
-        self._task, loop = task, task.position_loop
+        self._task, plant, loop = task, task.plant, task.plant.position_loop
         self._deviation, self._velocity = state[0] - task.position[..., 0, :], state[1]
         # The robot behind its loop, and the commands that it has yet to follow, are deviations too.
         self._robot, self._follow = (self._deviation, self._velocity), loop and loop.transition(task.dt, state[0])
         self._commands = [self._deviation] * (loop.delay_steps if loop else 0)
-        self._read = task.sensor and task.sensor.start(state[0], task.dt, generator)
+        self._read = plant.sensor and plant.sensor.start(state[0], task.dt, generator)
         gains = task.stiffness, task.damping, task.mass
-        self._filter = None if task.stiffness_filter is None else task.stiffness_filter.start(*gains)
-        self._maps = (each for _, maps in tick_maps(task, task.dt / task.substeps) for each in maps.unbind(-3))
+        self._filter = plant.stiffness_filter and plant.stiffness_filter.start(*gains)
+        self._maps = (each for _, maps in tick_maps(task, task.dt / plant.substeps) for each in maps.unbind(-3))
 
     def run(self, tick: int, force: Tensor) -> dict[str, Tensor]:
         """Fields of a Rollout at the start of a tick under a force (..., d), and the deviation that is commanded."""
         task, commanded = self._task, self._deviation
-        desired, mass = task.position[..., tick, :], mass_at(task.mass, tick)
-        stiffness, damping = (gain[..., tick, :, :] for gain in (task.stiffness, task.damping))
+        desired = task.position[..., tick, :]
+        stiffness, damping, mass = (gain[..., tick, :, :] for gain in (task.stiffness, task.damping, task.mass))
         away, speed = (commanded, self._velocity) if self._follow is None else self._robot
         measured = total = force + self._wall(away + desired, speed)
         record = {"deviation": away, "commanded": commanded, "velocity": speed, "force": total}
@@ -144,7 +144,7 @@ class Loop:
                 record["tank_energy"] = self._filter.tank_energy
             each = tick_map(stiffness, damping, mass, task.dt)
         push = (damping @ task.velocity[..., tick, :].unsqueeze(-1)).squeeze(-1) + task.inertial_force[..., tick, :]
-        for part in range(task.substeps):
+        for part in range(task.plant.substeps):
             before = self._deviation, self._velocity
             if part:  # the walls are evaluated anew in each part of the tick
                 measured = force + self._wall(before[0] + desired, before[1])
@@ -171,7 +171,7 @@ class Loop:
             self._filter.carry(task.transport[..., tick, :, :])
 
     def _wall(self, position: Tensor, velocity: Tensor) -> Tensor:
-        walls, p = self._task.environment, self._task.n_positions
+        walls, p = self._task.plant.environment, self._task.n_positions
         if walls is None:
             return torch.zeros_like(position)
         force = walls.force(position[..., :p], velocity[..., :p])
@@ -239,7 +239,7 @@ def _check_memory(task: Task, n_rollouts: int) -> None:
     # Measured: eight motions are held, tick by tick fourteen, of poses one more and two orientations, and where
     # rollouts differ in their gains, twelve matrices.
     d = task.position.shape[-1]
-    own_gains = task.stiffness.ndim > 3 or task.stiffness_filter is not None
+    own_gains = task.stiffness.ndim > 3 or task.plant.stiffness_filter is not None
     of_each = (8 if task.is_linear else 14) * d + (12 * d * d if own_gains else 0)
     of_each += 0 if task.orientation is None else d + 8
     needed = of_each * n_rollouts * task.n_ticks * task.position.element_size()

@@ -71,8 +71,9 @@ def simulate(
     task = _task_of(schedule, plant)
     push = None if force is None else torch.tensor(checks.array(force, "force", task.velocity.shape))
     draw = checks.seed(random_state)
-    noisy = task.sensor is not None and task.sensor.is_noisy  # else nothing is drawn: None is the caller's global state
-    generator = torch.Generator().manual_seed(int(draw.randint(2**31 - 1))) if noisy else None
+    sensor, generator = task.plant.sensor, None
+    if sensor is not None and sensor.is_noisy:  # else nothing is drawn: None is the caller's global state
+        generator = torch.Generator().manual_seed(int(draw.randint(2**31 - 1)))
     run = run_task(task, push, generator=generator).numpy()
     return replace(run, time=schedule.time[0] + run.time, units=schedule.units)
 

@@ -12,14 +12,13 @@ is exact: R and R_d are then both turned in the world, and e with them. It is th
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torch_pbd.control.filters import StiffnessFilter, admittance_rate
-from torch_pbd.control.simulation.sensor import ForceSensor, PositionLoop
+from torch_pbd.control.filters import admittance_rate
 from torch_pbd.linalg import broadcast_shapes
 
 State = tuple[Tensor, Tensor]
@@ -27,11 +26,6 @@ State = tuple[Tensor, Tensor]
 
 # Transitions that are computed together, which bounds the memory; a power of 2, as the lengths of blocks are.
 _MATRICES_AT_ONCE = 2**13
-
-
-def mass_at(mass: Tensor, ticks: int | slice) -> Tensor:
-    """Mass at some ticks, from one mass (d, d) or those of all ticks (..., T, d, d)."""
-    return mass if mass.ndim == 2 else mass[..., ticks, :, :]
 
 
 @runtime_checkable
@@ -44,11 +38,11 @@ class Environment(Protocol):
 
 @dataclass(frozen=True)
 class Task:
-    """Checked inputs of a run: motions (..., T, d), gains (..., T, d, d), and the parts that act in the loop, or None.
+    """Checked inputs of a run: motions (..., T, d), gains and masses (..., T, d, d), and the ``plant`` that follows.
 
-    At the end of each tick but the last, the desired pose moves on by its step. The mass is (d, d), or (..., T, d, d)
-    with one for each tick. Positions of poses end in zeros, since their rotations are relative to the desired
-    ``orientation`` (..., T, 4); vectors turn with it by ``transport`` (..., T, 3, 3).
+    At the end of each tick but the last, the desired pose moves on by its step. Positions of poses end in zeros, since
+    their rotations are relative to the desired ``orientation`` (..., T, 4); vectors turn with it by ``transport``
+    (..., T, 3, 3).
     """
 
     position: Tensor
@@ -59,11 +53,7 @@ class Task:
     damping: Tensor
     mass: Tensor
     dt: float
-    sensor: ForceSensor | None
-    position_loop: PositionLoop | None
-    environment: Environment | None
-    substeps: int
-    stiffness_filter: StiffnessFilter | None
+    plant: Any
     orientation: Tensor | None = None
     transport: Tensor | None = None
 
@@ -86,8 +76,9 @@ class Task:
     @property
     def is_linear(self) -> bool:
         """Whether nothing acts in the loop and all rollouts of a batch share gains and desired motion."""
-        acting = (self.sensor, self.position_loop, self.environment, self.stiffness_filter)
-        return not self.batch and all(part is None for part in acting)
+        plant = self.plant
+        parts = (plant.sensor, plant.position_loop, plant.environment, plant.stiffness_filter)
+        return not self.batch and all(part is None for part in parts)
 
     def carry(self, tick: int, deviation: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
         """Deviations from the desired pose after a tick instead of before it."""
@@ -151,9 +142,9 @@ def tick_maps(task: Task, dt: float) -> Iterator[tuple[slice, Tensor]]:
     """Stretches of n ticks, each with its maps (..., n, 2 d, 3 d) over ``dt`` under the task's gains."""
     n_together = max(1, _MATRICES_AT_ONCE // task.stiffness[..., 0, 0, 0].numel())
     for first in range(0, task.n_ticks, n_together):
-        ticks = slice(first, min(first + n_together, task.n_ticks))
-        gains = task.stiffness[..., ticks, :, :], task.damping[..., ticks, :, :]
-        yield ticks, tick_map(*gains, mass_at(task.mass, ticks), dt)
+        ticks = slice(first, first + n_together)
+        stiffness, damping, mass = (gain[..., ticks, :, :] for gain in (task.stiffness, task.damping, task.mass))
+        yield ticks, tick_map(stiffness, damping, mass, dt)
 
 
 def tick_map(stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> Tensor:
