@@ -16,7 +16,7 @@ from torch_pbd.control.stability.common_function import common_function
 from torch_pbd.control.stability.dynamics import ErrorDynamics, largest_gain
 from torch_pbd.control.stability.lyapunov import Knots, held_growth
 from torch_pbd.control.stability.report import StabilityReport
-from torch_pbd.linalg import evenly, least_eigenvalue, symmetrize
+from torch_pbd.linalg import evenly, symmetrize
 
 # Upper bound of environment stiffnesses in N/m, above anything real.
 _STIFFEST = 1e9
@@ -115,11 +115,10 @@ def certify(
 def _damping_ratio(dynamics: ErrorDynamics) -> float:
     """Smallest damping ratio of all rows, each with its own mass."""
     squared, _, damping = dynamics.modes
-    root, identity = squared.pow(-0.25), torch.eye(squared.shape[-1]).to(squared)
+    root = squared.pow(-0.25)
     if damping.ndim == 2:
         return 0.5 * float((root * damping * root).min())
-    relative = root[:, :, None] * damping * root[:, None, :]
-    return 0.5 * least_eigenvalue(lambda rows, q, p: q * relative[rows] + p * identity, len(relative))[0]
+    return 0.5 * float(torch.linalg.eigvalsh(root[:, :, None] * damping * root[:, None, :]).min())
 
 
 def stiffest_environment(
@@ -137,12 +136,8 @@ def stiffest_environment(
     stay within the unit circle, about ``damping / (lag of loop and sensor)``. Gains are held, and axes are independent;
     of more than 200 knots, 200 are checked together with those of the least damping and stiffness.
     """
-    identity = torch.eye(stiffness.shape[-1]).to(stiffness)
-    softest = [
-        least_eigenvalue(lambda rows, q, p, gain=gain: q * gain[rows] + p * identity, len(gain))[1]
-        for gain in (stiffness, damping)
-    ]
-    chosen = torch.cat([evenly(len(stiffness), _MAX_KNOTS), torch.tensor(softest)])
+    softest = [torch.linalg.eigvalsh(gain)[:, :1].argmin(0) for gain in (stiffness, damping)]
+    chosen = torch.cat([evenly(len(stiffness), _MAX_KNOTS), *softest])
     stiffness, damping = stiffness[chosen], damping[chosen]
     axes = torch.linalg.eigh(symmetrize(damping)).eigenvectors
     along = [(axes * (matrix @ axes)).sum(-2).reshape(-1, 1, 1) for matrix in (stiffness, damping, mass)]

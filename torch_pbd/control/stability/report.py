@@ -117,10 +117,9 @@ class StabilityReport:
             certificate += f"; held between rows, V grows by {self.held_growth - 1.0:.2g}"
         warning = "" if self.gain <= MAX_GAIN else f"  <- above {MAX_GAIN:g}: disturbances grow on the way"
         promise = f"without a force deviations die out, of {which}; a bounded force moves it by a bounded amount"
+        verdict = "guaranteed" if self.stable else f"NOT GUARANTEED: {remedy}, damp more, or use a filter"
         rows = {
-            "exact and without lag": "guaranteed"
-            if self.stable
-            else f"NOT GUARANTEED: {remedy}, damp more, or use a filter",
+            "exact and without lag": verdict,
             "any-schedule rule": self._any_schedule(),
             "certificate of this one": f"{'holds' if self.certified else 'DOES NOT HOLD'}: {certificate}",
             "replay speed limit": own,
@@ -142,14 +141,11 @@ class StabilityReport:
 
     def _any_schedule(self) -> str:
         holds = f"holds: in any order at a rate of {self.any_schedule_rate:.3g} /s"
-        text = f"{holds if self.stable_at_any_schedule else 'does not hold'}; damping ratio {self.damping_ratio:.3g}"
+        enough = f"one of {self.required_damping_ratio:.3g} will do for stiffness ratio {self.stiffness_ratio:.3g}"
         if math.isnan(self.stiffness_ratio):
-            return (
-                f"{text}; no ratio is enough in itself for {'poses' if self.is_constant else 'an inertia that varies'}"
-            )
-        return (
-            f"{text}; one of {self.required_damping_ratio:.3g} will do for stiffness ratio {self.stiffness_ratio:.3g}"
-        )
+            enough = f"no ratio is enough in itself for {'poses' if self.is_constant else 'an inertia that varies'}"
+        holds = holds if self.stable_at_any_schedule else "does not hold"
+        return f"{holds}; damping ratio {self.damping_ratio:.3g}; {enough}"
 
     def _environment(self) -> str:
         if math.isnan(self.environment_stiffness):
