@@ -85,7 +85,7 @@ def test_a_schedule_is_the_same_in_parts(monkeypatch):
         make_tunnel_demonstrations(rate=10.0, random_state=0)
     )
     whole = controller.schedule(50.0)
-    monkeypatch.setattr("torch_pbd.control.impedance._AT_ONCE", 64)
+    monkeypatch.setattr("torch_pbd.estimators.door._CHUNK", 64)
     parts = controller.schedule(50.0)
     for name in ("stiffness", "damping", "covariance", "type1"):
         np.testing.assert_allclose(getattr(parts, name), getattr(whole, name), rtol=1e-10, atol=1e-14)

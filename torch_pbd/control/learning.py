@@ -1,7 +1,8 @@
-"""Steps of a controller's fit: demonstrations from what is given, outputs, learned variability, and the law over it."""
+"""Steps of a controller's fit: demonstrations from what is given, outputs, variability, the law over it, and gains."""
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -9,6 +10,7 @@ from sklearn.base import BaseEstimator, clone
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
+from torch_pbd.control.matrices import damping_from_stiffness
 from torch_pbd.control.primitive.outputs import RESOLUTION, Outputs
 from torch_pbd.control.primitive.smoothing import UNKNOWN
 from torch_pbd.control.stiffness import RotationLimits, StiffnessLaw
@@ -17,9 +19,20 @@ from torch_pbd.data.alignment import TIMING_REMOVED
 from torch_pbd.data.poses import ROTATION
 from torch_pbd.data.units import ANGLES, LENGTHS
 from torch_pbd.estimators.base import CovarianceRegressor
-from torch_pbd.estimators.door import prior_covariance
+from torch_pbd.estimators.door import by_chunks, prior_covariance
 from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
 from torch_pbd.estimators.validation import check_groups, check_squares, checked_rows, fit_with_groups
+
+_FAR = 1e6  # distance in ranges of the input at which only the prior remains
+
+
+class Gains(NamedTuple):
+    """Stiffness and damping (n, d, d), and the covariance (n, d, d) and Type I uncertainty (n,) they come from."""
+
+    stiffness: Floats
+    damping: Floats
+    covariance: Floats
+    type1: Floats
 
 
 def as_demonstrations(X: Demonstrations | ArrayLike, y: ArrayLike | None, groups: ArrayLike | None) -> Demonstrations:
@@ -113,21 +126,15 @@ def fit_covariance(
         inverse: Floats = np.linalg.inv(outputs.axes).astype(np.float64)
         for name, prior in fitted.get_params(deep=True).items():
             if name.rpartition("__")[2] == "prior" and not (prior is None or isinstance(prior, str)):
-                own = _PriorOfCoordinates(prior, inverse)
+                own = partial(_prior_of_coordinates, prior, inverse)
                 fitted.set_params(**{name: own if callable(prior) else own(np.empty((0, 1)))})
     groups, steps = np.nonzero(known & (known.sum(axis=0) > 1))
     return fit_with_groups(fitted, inputs[steps], outputs.encode(varying[groups, steps]), groups)
 
 
-@dataclass(frozen=True)
-class _PriorOfCoordinates:
-    """Prior of the coordinates that are learned, from one of the outputs that is a function of the input."""
-
-    prior: Any
-    inverse: Floats
-
-    def __call__(self, X: Floats) -> Floats:
-        return self.inverse @ prior_covariance(self.prior, X, len(self.inverse)) @ self.inverse.T
+def _prior_of_coordinates(prior: Any, inverse: Floats, X: Floats) -> Floats:
+    """Prior at inputs X of the coordinates that are learned, from one of the outputs."""
+    return inverse @ prior_covariance(prior, X, len(inverse)) @ inverse.T
 
 
 def outputs_of(demonstrations: Demonstrations) -> Outputs:
@@ -164,3 +171,41 @@ def fit_law(controller: Any, law: StiffnessLaw, varying: Floats) -> StiffnessLaw
     covariance = outputs.covariance(learned, path, cross_terms=law.cross_terms)
     resolution = (RESOLUTION * outputs.extents(varying)).tolist()
     return law.fitted(covariance, resolution=resolution, mass=controller.mass_)
+
+
+def gains_at(controller: Any, time: Floats, path: Floats) -> Gains:
+    """Gains of a fitted controller at movement times (n,) and desired outputs (n, d), for poses in world axes."""
+    return Gains(*by_chunks(lambda rows: _gains(controller, time[rows], path[rows]), np.arange(len(time))))
+
+
+def _gains(controller: Any, time: Floats, path: Floats) -> Gains:
+    """Gains of the learned variability, of which a regressor bridges holes that are short beside its length scale.
+
+    Of the share of the time that is unsampled, the covariance is therefore its prior, at the input, or if that is the
+    same everywhere, far from all inputs.
+    """
+    regressor, phase, duration = controller.covariance_, controller.reproduction_.phase, controller.duration_
+    law, mass, outputs, inputs = controller.law_, controller.mass_, controller.outputs_, phase(time)
+    learned, type1 = regressor.predict_cov(inputs), regressor.predict_uncertainty(inputs).type1
+    sampled = covariance = outputs.covariance(learned, path, cross_terms=law.cross_terms)
+    hole = np.interp(time, np.linspace(0.0, duration, len(controller.unsampled_)), controller.unsampled_)
+    if hole.any():
+        prior, share = getattr(regressor, "prior", None), hole[:, np.newaxis, np.newaxis]
+        if callable(prior):
+            wide = prior_covariance(prior, inputs, learned.shape[-1])
+        else:
+            start, end = phase(np.array([0.0, duration]))
+            wide = regressor.predict_cov((end + _FAR * (end - start))[np.newaxis])
+        whole = (1.0 - share) * learned + share * wide
+        covariance = outputs.covariance(whole, path, cross_terms=law.cross_terms)
+        type1 = 1.0 - (1.0 - hole) * (1.0 - type1)
+    if controller.on_unknown == "raise" and (type1 > UNKNOWN).any():
+        index = int(np.argmax(type1 > UNKNOWN))
+        raise ValueError(
+            f"There are no data at time {time[index]:g} s: the Type I uncertainty is {type1[index]:.2f}. Ask within "
+            "the demonstrations, or let on_unknown='soft' make the robot compliant there."
+        )
+    # The share type1 towards the least stiffness already accounts for holes; their prior would count them twice.
+    stiffness = law(sampled, mass, type1=type1) if controller.on_unknown == "soft" else law(covariance, mass)
+    damping = damping_from_stiffness(stiffness, mass, controller.damping_ratio)
+    return Gains(stiffness.numpy(), damping.numpy(), covariance, type1)

@@ -12,7 +12,7 @@ from sklearn.utils.validation import check_array, check_is_fitted
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.control.impedance import Gains, gains_at
+from torch_pbd.control.learning import Gains, gains_at
 from torch_pbd.control.primitive.outputs import Outputs
 from torch_pbd.control.primitive.reproduction import Reproduction
 from torch_pbd.control.schedule.rows import tick_times
@@ -185,11 +185,11 @@ class Planning(BaseEstimator):
         time = tick_times(self.duration_ / speed, rate, self.n_outputs_, settle=settle)
         goal, start = self._place(goal, "goal", len(time) if via is None else 0), self._place(start, "start")
         bent, goal, start = planned(self, goal, start, via)
-        path, velocity, acceleration, moved = bent.reproduction_.plan(time, goal, start, speed)
-        rows: dict[str, Any] = outputs.motion(path, velocity, acceleration)
+        motion, moved = bent.reproduction_.plan(time, goal, start, speed)
+        rows: dict[str, Any] = outputs.motion(*motion)
         largest = np.linalg.norm(rows["velocity"][:, : outputs.n_positions], axis=1).max()
         self._refuse_beyond(bounds, distance=np.linalg.norm(np.ptp(rows["position"], axis=0)), speed=largest)
-        gains = gains_at(bent, moved, path)
+        gains = gains_at(bent, moved, motion[0])
         units = np.multiply.outer(outputs.scales, outputs.scales)
         rows |= gains._asdict() | {"covariance": units * gains.covariance}
         return Schedule(time=time, **rows, **_labels(self))

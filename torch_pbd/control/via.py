@@ -135,9 +135,9 @@ def _path_at(times: list[float], controller: Any, goal: Floats | None, start: Fl
     grid, plan = np.unique([0.0, *times]), controller.reproduction_.plan
     goal = goal if goal is None or goal.ndim == 1 else None  # of one that moves nobody knows the path
     if controller.adaptation == "safe" or (goal is None and start is None):
-        return dict(zip(grid.tolist(), plan(grid, goal, start, 1.0)[0], strict=True))
+        return dict(zip(grid.tolist(), plan(grid, goal, start, 1.0)[0][0], strict=True))
     even = np.linspace(0.0, controller.duration_, 20 * controller.n_steps)  # the equation is solved tick by tick
-    return dict(zip(grid.tolist(), CubicSpline(even, plan(even, goal, start, 1.0)[0])(grid), strict=True))
+    return dict(zip(grid.tolist(), CubicSpline(even, plan(even, goal, start, 1.0)[0][0])(grid), strict=True))
 
 
 class _Likely:

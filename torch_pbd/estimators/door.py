@@ -267,7 +267,7 @@ class TorchEstimator(BaseEstimator, ABC):
                 self.module_ = ConditionalNormal.restored(self._core_class, config, tensors).requires_grad_(False)
 
 
-def by_chunks(function: Callable[[Any], Any], x: Tensor | Floats) -> Any:
+def by_chunks(function: Callable[[Any], Any], x: Tensor | NDArray[Any]) -> Any:
     """Tuple of arrays that a function of rows gives for x, called for a bounded number of rows at a time."""
     if len(x) <= _CHUNK:
         return function(x)

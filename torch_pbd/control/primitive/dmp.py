@@ -190,9 +190,9 @@ class DMP:
         if not safe:
             return position, scaled / self.tau
         acceleration = (self.alpha * (self.beta * (driven - position) - scaled) + at_ticks) / self.tau**2  # eq. (16)
-        path, ends = (position, scaled / self.tau, acceleration), {"own_goal": own_goal, "goals": goals, "start": start}
-        position, velocity, _ = adapt(path, time, (position, time), **ends, duration=self.duration or self.tau)
-        return position, velocity
+        path, ends = [position, scaled / self.tau, acceleration], {"own_goal": own_goal, "goals": goals, "start": start}
+        motion = adapt(torch.stack(path), time, (position, time), **ends, duration=self.duration or self.tau)
+        return motion[0], motion[1]
 
     def _solve(self, forcing: Tensor, goals: Tensor, dt: float, state: Tensor) -> Tensor:
         """States at the ticks, exact for forcing that is linear between them and goals held over them."""
@@ -222,7 +222,7 @@ def _broadcast(parts: dict[str, Tensor], n_ticks: int | None = None) -> torch.Si
 
 
 def adapt(
-    path: tuple[Float[Tensor, "*b t d"], ...],
+    path: Float[Tensor, "3 *b t d"],
     time: Float[Tensor, " t"],
     whole: tuple[Float[Tensor, "*b m d"], Float[Tensor, " m"]],
     *,
@@ -230,7 +230,7 @@ def adapt(
     goals: Float[Tensor, "*#b t d"],
     start: Float[Tensor, "*#b d"],
     duration: float,
-) -> tuple[Tensor, ...]:
+) -> Float[Tensor, "3 *b t d"]:
     """Position, velocity and acceleration of a path at given times, adapted to another start and other goals.
 
     With u the path relative to its own goal, the motion is ``goal + k u + c``: c takes start and goal along, by minimum
@@ -268,7 +268,7 @@ def adapt(
         shape = keep[..., None, :, None] * relative[..., ticks, :, :]
         parts.append(_still(goal).unsqueeze(-3) + shape + carried.squeeze(-1))
     motion = torch.cat([*(part[..., :-1, :, :] for part in parts[:-1]), parts[-1]], dim=-3)
-    return motion.unbind(-1)
+    return motion.movedim(-1, 0)
 
 
 def _quintics(share: Float[Tensor, "*m"], horizon: Tensor) -> Float[Tensor, "*m 3 3"]:

@@ -41,8 +41,6 @@ _CONSTANTS, _GATE_CONSTANTS = (0.02, 1e12), (0.01, math.inf)
 # The phase must tell times apart: exp(-30) is 1e-13, and 1e-6 leaves ten digits. Its logarithm is time in other units.
 _DECAY = {"s": (1e-6, 30.0), "log_s": (1e-6, 1e12)}
 
-_Path = tuple[Floats, Floats, Floats]  # position, velocity and acceleration (n, d)
-
 
 @dataclass(eq=False)
 class Reproduction:
@@ -134,10 +132,10 @@ class Reproduction:
                     "robot at rest needs a ramp at the start, and settle > 0 at the end."
                 )
 
-    def motion(self, time: Floats) -> _Path:
-        """Position, velocity and acceleration (n, d) at any times (n,): at rest before 0, and long after the end."""
+    def motion(self, time: Floats) -> Floats:
+        """Position, velocity and acceleration (3, n, d) at any times (n,): at rest before 0, and long after the end."""
         path = _held(self._curve, time)
-        return path if self.bend is None else _sum(path, _held(self.bend, time))
+        return path if self.bend is None else path + _held(self.bend, time)
 
     @cached_property
     def _curve(self) -> CubicHermiteSpline:
@@ -157,22 +155,19 @@ class Reproduction:
             velocities -= left * 30.0 * (share * (1.0 - share)) ** 2 / time[-1]
         return CubicHermiteSpline(time, positions, velocities, axis=0)
 
-    def plan(
-        self, time: Floats, goal: Floats | None, start: Floats | None, speed: float
-    ) -> tuple[Floats, Floats, Floats, Floats]:
-        """Position, velocity and acceleration (n, d) at times (n,) from 0, and movement time (n,) of the gains there.
+    def plan(self, time: Floats, goal: Floats | None, start: Floats | None, speed: float) -> tuple[Floats, Floats]:
+        """Position, velocity and acceleration (3, n, d) at times (n,) from 0, and movement time (n,) of the gains.
 
         To goals (d,) or (n, d), from a start (d,), None for those demonstrated. With adaptation="safe" it brakes to
         rest at the end of the movement, if the times go on after it.
         """
         begin = self.start if start is None else start
         goals = np.broadcast_to(self.goal if goal is None else goal, (len(time), len(self.goal)))
-        passed = speed * time
         plan = self._safe if self.dmp.adaptation == "safe" else self._additive
-        (position, velocity, acceleration), known = plan(passed, goals, begin, goal is not None or start is not None)
-        return position, speed * velocity, speed**2 * acceleration, known
+        path, known = plan(speed * time, goals, begin, goal is not None or start is not None)
+        return path * np.array([1.0, speed, speed**2])[:, np.newaxis, np.newaxis], known
 
-    def _additive(self, passed: Floats, goals: Floats, start: Floats, changed: bool) -> tuple[_Path, Floats]:
+    def _additive(self, passed: Floats, goals: Floats, start: Floats, changed: bool) -> tuple[Floats, Floats]:
         """Motion by movement time, and that of the gains; the primitive is solved with the other start and goals."""
         path = self.motion(passed)
         if changed:
@@ -180,20 +175,18 @@ class Reproduction:
             still, step = np.zeros(goals.shape), float(passed[1])
             run = self.dmp.rollout(still, step, goal=goals - self.goal, position0=start - self.start)
             answer = CubicHermiteSpline(step * np.arange(len(passed)), *(part.numpy() for part in run), axis=0)
-            path = _sum(path, (answer(passed), answer(passed, 1), answer(passed, 2)))
+            path = path + np.stack([answer(passed, order) for order in range(3)])
         return path, passed
 
-    def _safe(self, passed: Floats, goals: Floats, start: Floats, changed: bool) -> tuple[_Path, Floats]:
+    def _safe(self, passed: Floats, goals: Floats, start: Floats, changed: bool) -> tuple[Floats, Floats]:
         """Motion by movement time, adapted without a throw, and that of the gains."""
         *braked, known = self._braked(passed)
         path = _along(self._curve, *braked)
         if changed:
             whole = _tensor(self._curve(self.time)), _tensor(self.time)
             ends = {"own_goal": _tensor(self.goal), "goals": _tensor(goals), "start": _tensor(start)}
-            run = adapt(tuple(map(_tensor, path)), _tensor(passed), whole, **ends, duration=float(self.time[-1]))
-            position, velocity, acceleration = (part.numpy() for part in run)
-            path = position, velocity, acceleration
-        return (path if self.bend is None else _sum(path, _along(self.bend, *braked))), known
+            path = adapt(_tensor(path), _tensor(passed), whole, **ends, duration=float(self.time[-1])).numpy()
+        return path if self.bend is None else path + _along(self.bend, *braked), known
 
     def _braked(self, passed: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Movement time (n,) that comes to rest at the end of the movement, its derivatives, and that of the gains.
@@ -218,20 +211,16 @@ class Reproduction:
         return np.minimum(moved, end), rate, slope, np.maximum(moved, passed - 0.5 * brake)
 
 
-def _along(curve: PPoly, moved: Floats, rate: Floats, slope: Floats) -> _Path:
-    """Motion (n, d) along a curve whose own time (n,) moves at a rate (n,), which changes at a slope (n,)."""
+def _along(curve: PPoly, moved: Floats, rate: Floats, slope: Floats) -> Floats:
+    """Motion (3, n, d) along a curve whose own time (n,) moves at a rate (n,), which changes at a slope (n,)."""
     rate, slope, velocity = rate[:, np.newaxis], slope[:, np.newaxis], curve(moved, 1)
-    return curve(moved), velocity * rate, curve(moved, 2) * rate**2 + velocity * slope
+    return np.stack([curve(moved), velocity * rate, curve(moved, 2) * rate**2 + velocity * slope])
 
 
-def _held(curve: PPoly, time: Floats) -> _Path:
-    """Motion (n, d) along a curve at times (n,): at rest before its start and after its end."""
+def _held(curve: PPoly, time: Floats) -> Floats:
+    """Motion (3, n, d) along a curve at times (n,): at rest before its start and after its end."""
     within = np.clip(time, curve.x[0], curve.x[-1])
     return _along(curve, within, 1.0 * (within == time), np.zeros(len(time)))
-
-
-def _sum(first: _Path, second: _Path) -> _Path:
-    return first[0] + second[0], first[1] + second[1], first[2] + second[2]
 
 
 def primitive(controller: Any) -> DMP:
