@@ -7,4 +7,4 @@ from torch_pbd import linalg
 
 def test_shapes_of_the_torch_floors_are_checked_while_the_tests_run():
     with pytest.raises(TypeCheckError, match="scale_tril"):  # and not broadcast
-        linalg.gaussian_log_density(torch.zeros(1, 2), torch.eye(2).expand(3, 2, 2))
+        linalg.log_density(torch.zeros(1, 2), torch.eye(2).expand(3, 2, 2))

@@ -246,20 +246,15 @@ def real_array(values: Any, name: str) -> NDArray[Any]:
         raise ValueError(f"{name} has dtype {array.dtype}: give an array of plain numbers.")
     if kind == "O":
         for place, entry in enumerate(array.flat):
-            _check_entry(entry, name, place)
+            if np.ndim(entry):
+                raise TypeError(f"{name} holds a {type(entry).__name__} as entry {place}: give one number for each.")
+            try:
+                _ = is_missing(entry) or float(entry)  # where NaN are refused, more is said of what is missing
+            except TypeError as error:
+                raise TypeError(f"{name} holds what is no number, as entry {place}: {error}.") from error
+            except OverflowError as error:
+                raise ValueError(f"{name} holds a number too large for float64, as entry {place}.") from error
     return array
-
-
-def _check_entry(entry: Any, name: str, place: int) -> None:
-    """Check that an object is one number, or missing, of which more is said where NaN are refused."""
-    if np.ndim(entry):
-        raise TypeError(f"{name} holds a {type(entry).__name__} as entry {place}: give one number for each.")
-    try:
-        _ = is_missing(entry) or float(entry)
-    except TypeError as error:
-        raise TypeError(f"{name} holds what is no number, as entry {place}: {error}.") from error
-    except OverflowError as error:
-        raise ValueError(f"{name} holds a number too large for float64, as entry {place}.") from error
 
 
 def is_missing(entry: Any) -> bool:

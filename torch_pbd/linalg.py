@@ -133,33 +133,28 @@ def safe_cholesky(matrix: Float[Tensor, "*b n n"], *, name: str) -> Float[Tensor
     return cholesky_with_jitter(matrix, name=name)[0]
 
 
-def gaussian_log_density(residual: Float[Tensor, "*b d"], scale_tril: Float[Tensor, "*b d d"]) -> Float[Tensor, "*b"]:
-    """Log density of N(0, scale_tril @ scale_tril.mT) at each residual."""
-    square, log_det = _square_and_log_det(residual, scale_tril)
-    return -0.5 * square - log_det - 0.5 * residual.shape[-1] * math.log(2 * math.pi)
+def log_det(factor: Float[Tensor, "*b d d"]) -> Float[Tensor, "*b"]:
+    """Log determinants of triangular matrices, but for their signs."""
+    return factor.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
 
 
-def student_log_density(
-    residual: Float[Tensor, "*b d"], scale_tril: Float[Tensor, "*b d d"], degrees: Float[Tensor, "*b"]
+def log_density(
+    residual: Float[Tensor, "*b d"], scale_tril: Float[Tensor, "*b d d"], degrees: Float[Tensor, "*b"] | None = None
 ) -> Float[Tensor, "*b"]:
-    """Log density of the multivariate Student's t whose covariance is ``scale_tril @ scale_tril.mT``.
+    """Log density of a law with the covariance ``scale_tril @ scale_tril.mT`` at each residual.
 
-    ``degrees`` are above two; where they are many it is the normal density.
+    It is normal, or multivariate Student's t of ``degrees`` above two; where these are many they are the same.
     """
-    size = residual.shape[-1]
-    square, log_det = _square_and_log_det(residual, scale_tril)
+    whitened = torch.linalg.solve_triangular(scale_tril, residual.unsqueeze(-1), upper=False)
+    square, size = whitened.square().sum((-2, -1)), residual.shape[-1]
+    if degrees is None:
+        return -0.5 * square - log_det(scale_tril) - 0.5 * size * math.log(2 * math.pi)
     # With the scale matrix (df - 2) / df times the covariance the density is
     # gamma((df + d) / 2) / gamma(df / 2) |(df - 2) pi S|^-1/2 (1 + x' S^-1 x / (df - 2))^-(df + d)/2.
     capped = degrees.clamp_max(1e7)  # beyond, the gamma functions lose more digits than the two densities differ by
     constant = torch.lgamma(0.5 * (capped + size)) - torch.lgamma(0.5 * capped)
     constant = constant - 0.5 * size * (math.pi * (capped - 2.0)).log()
-    return constant - log_det - 0.5 * (capped + size) * torch.log1p(square / (capped - 2.0))
-
-
-def _square_and_log_det(residual: Tensor, scale_tril: Tensor) -> tuple[Tensor, Tensor]:
-    """Squared Mahalanobis distances of residuals (..., d), and log determinants of the factors."""
-    whitened = torch.linalg.solve_triangular(scale_tril, residual.unsqueeze(-1), upper=False)
-    return whitened.square().sum((-2, -1)), scale_tril.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    return constant - log_det(scale_tril) - 0.5 * (capped + size) * torch.log1p(square / (capped - 2.0))
 
 
 class _SpectralMap(torch.autograd.Function):

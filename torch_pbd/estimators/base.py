@@ -22,7 +22,7 @@ from torch_pbd.estimators import validation
 from torch_pbd.estimators.door import Integers, Standardization, TorchEstimator, row_order
 from torch_pbd.estimators.validation import checked_queries, checked_rows
 from torch_pbd.files.memory import require_much
-from torch_pbd.linalg import gaussian_log_density, student_log_density
+from torch_pbd.linalg import log_density
 from torch_pbd.models import Core
 from torch_pbd.models.conditional import ConditionalNormal
 from torch_pbd.optim.batch import FitReport, Progress, Status
@@ -229,15 +229,12 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator):
         if targets.shape[1] != self.n_outputs_:
             raise ValueError(f"y has {targets.shape[1]} outputs, but the model was fitted with {self.n_outputs_}.")
 
-        def log_density(rows: Tensor) -> tuple[Tensor]:
+        def at(rows: Tensor) -> tuple[Tensor]:
             x, y = rows.tensor_split([self.n_features_in_], dim=1)
             mean, scale_tril = self.module_(x, *self._prior_tril_at(x))
-            degrees = self.module_.degrees(x)
-            if degrees is None:
-                return (gaussian_log_density(y - mean, scale_tril),)
-            return (student_log_density(y - mean, scale_tril, degrees),)
+            return (log_density(y - mean, scale_tril, self.module_.degrees(x)),)
 
-        return self._arrays(log_density, np.hstack([inputs, targets]))[0]
+        return self._arrays(at, np.hstack([inputs, targets]))[0]
 
     def score(self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None) -> float:
         """Mean log density of the rows of y at X, in nats: higher is better.

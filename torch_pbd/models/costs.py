@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torch_pbd.gp.latent import LatentValues
-from torch_pbd.linalg import cholesky_with_jitter
+from torch_pbd.linalg import cholesky_with_jitter, log_det
 from torch_pbd.models import VARIANCE_FLOOR
 from torch_pbd.models.links import Blocks, Covariances, Link
 from torch_pbd.optim.batch import FitReport, Progress
@@ -47,8 +47,7 @@ class Likelihood:
         scatter_root, counts = self._rows
         scale_tril = Covariances(root, *self._rows).scale_tril
         whitened = torch.linalg.solve_triangular(scale_tril, scatter_root, upper=False)
-        log_det = counts[:, 0, 0] @ scale_tril.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        return self.weight * (0.5 * whitened.square().sum() + log_det + self._constant)
+        return self.weight * (0.5 * whitened.square().sum() + counts[:, 0, 0] @ log_det(scale_tril) + self._constant)
 
     def gradient(self, point: Covariances) -> Float[Tensor, "n b"]:
         """Gradient in the deviations, in closed form."""

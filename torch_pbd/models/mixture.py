@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from torch_pbd.exceptions import NotPositiveDefiniteError
-from torch_pbd.linalg import scale_tril_from_root, triangular_inverse
+from torch_pbd.linalg import log_det, scale_tril_from_root, triangular_inverse
 from torch_pbd.models import Core, MeanAndRoot, PriorTril, Shapes, blank, size_of
 from torch_pbd.optim.batch import FitReport, Progress, Status
 from torch_pbd.optim.descent import minimize
@@ -35,8 +35,7 @@ class Components:
 
     def log_joint(self, whitened: Float[Tensor, "k p n"]) -> Float[Tensor, "k n"]:
         """Log of weight times density, of each component at each row."""
-        log_det = self.scale_tril.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        peak = self.log_weight - log_det - 0.5 * self.mean.shape[-1] * math.log(2 * math.pi)
+        peak = self.log_weight - log_det(self.scale_tril) - 0.5 * self.mean.shape[-1] * math.log(2 * math.pi)
         return peak.unsqueeze(-1) - 0.5 * whitened.square().sum(1)
 
     def log_prob(self, data: Float[Tensor, "n p"]) -> Float[Tensor, " n"]:

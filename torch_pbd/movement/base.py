@@ -17,7 +17,7 @@ from torch_pbd.estimators.base import Uncertainty, shaped_as_y
 from torch_pbd.estimators.door import by_chunks
 from torch_pbd.estimators.validation import checked_rows
 from torch_pbd.files.memory import require_much
-from torch_pbd.linalg import gaussian_log_density, student_log_density
+from torch_pbd.linalg import log_density
 from torch_pbd.movement.law import MovementLaw, as_recordings, semidefinite_root
 
 
@@ -208,10 +208,8 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         root, info = torch.linalg.cholesky_ex(covariance)
         if info.any():
             raise ValueError("X has a row that is known without noise: it has no density. Leave it out.")
-        residual, degrees = torch.from_numpy(targets).reshape(mean.shape) - mean, self.predict_df(X)
-        if not np.isfinite(degrees).all():
-            return gaussian_log_density(residual, root).numpy()
-        return student_log_density(residual, root, torch.from_numpy(degrees)).numpy()
+        residual, degrees = torch.from_numpy(targets).reshape(mean.shape) - mean, torch.from_numpy(self.predict_df(X))
+        return log_density(residual, root, degrees if degrees.isfinite().all() else None).numpy()
 
     def score_demonstrations(self, X: Any, y: ArrayLike | None = None, *, groups: ArrayLike | None = None) -> Floats:
         """Joint log density of each demonstration, in nats, given the observations of :meth:`condition`.

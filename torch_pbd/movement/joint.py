@@ -130,7 +130,7 @@ class JointNormal:
         half_log_det += float(capacitance_root.diagonal().log().sum() + rest_root.diagonal().log().sum())
         if not math.isfinite(df):
             return -0.5 * (square + size * math.log(2.0 * math.pi)) - half_log_det
-        # linalg.student_log_density is the same but takes a factor of the covariance, which is never formed here.
+        # linalg.log_density is the same but takes a factor of the covariance, which is never formed here.
         constant = math.lgamma(0.5 * (df + size)) - math.lgamma(0.5 * df) - 0.5 * size * math.log((df - 2.0) * math.pi)
         return constant - half_log_det - 0.5 * (df + size) * math.log1p(square / (df - 2.0))
 

@@ -13,7 +13,7 @@ from torch_pbd.checks import Floats
 from torch_pbd.console import say
 from torch_pbd.data.alignment import interpolate
 from torch_pbd.data.demonstrations import Demonstration
-from torch_pbd.linalg import safe_cholesky, student_log_density
+from torch_pbd.linalg import log_density, safe_cholesky
 from torch_pbd.movement.base import MovementRegressor
 from torch_pbd.movement.law import Known, check_arrays
 from torch_pbd.movement.timing import Likelihood, Nodes, Timing, phases, register, time_of
@@ -133,9 +133,7 @@ class TimedMovement(MovementRegressor):
             mean, whole = mean.reshape(len(phase), -1), self.module_.covariances(phase, covariance)
             whole = whole[:, given][:, :, given] + torch.diag(noise.square().flatten()[given])
             root = safe_cholesky(whole, name="the covariance of what is known")
-            return student_log_density(
-                value.flatten()[given] - mean[:, given], root, torch.full_like(duration, self.df_)
-            )
+            return log_density(value.flatten()[given] - mean[:, given], root, torch.full_like(duration, self.df_))
 
         return log_likelihood
 

@@ -158,7 +158,10 @@ def minimize_scoring(
     while n_iter < max_iter and status is Status.MAX_ITER:
         n_iter += 1
         try:
-            step, slope = _checked_step(newton, x, value)
+            gradient, step = newton(x)
+            slope = float((gradient * step).sum())
+            if not math.isfinite(slope) or not bool(torch.isfinite(step).all()):
+                raise ValueError(f"the gradient is not finite (loss {value}, slope {slope} along the step)")
         except FAILURES as error:
             if n_iter == 1:
                 raise ValueError(f"The optimization cannot start: {error}.") from error
@@ -187,15 +190,6 @@ def _evaluate(loss: Callable[[Tensor], Tensor], curve: _Curve, x: Tensor) -> flo
         value = math.nan
     curve.add(value)
     return value if math.isfinite(value) else math.nan
-
-
-def _checked_step(newton: Callable[[Tensor], tuple[Tensor, Tensor]], x: Tensor, value: float) -> tuple[Tensor, float]:
-    """Newton's step, and the slope along it."""
-    gradient, step = newton(x)
-    slope = float((gradient * step).sum())
-    if not math.isfinite(slope) or not bool(torch.isfinite(step).all()):
-        raise ValueError(f"the gradient is not finite (loss {value}, slope {slope} along the step)")
-    return step, slope
 
 
 def _line_search(

@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from torch_pbd.linalg import safe_cholesky
+from torch_pbd.linalg import log_det, safe_cholesky
 from torch_pbd.models.heteroscedastic.processes import Evidence, FixedFeatures, Gradient
-from torch_pbd.models.heteroscedastic.regression import LinearEvidence, log_det, weights_factor
+from torch_pbd.models.heteroscedastic.regression import LinearEvidence, weights_factor
 from torch_pbd.models.heteroscedastic.whitening import NoiseCorrelation, whiten, whiten_vjp
 from torch_pbd.models.training import TrainingSet
 

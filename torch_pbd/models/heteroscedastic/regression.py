@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torch_pbd.linalg import safe_cholesky, symmetrize, triangular_inverse
+from torch_pbd.linalg import log_det, safe_cholesky, symmetrize, triangular_inverse
 from torch_pbd.models.heteroscedastic.whitening import tridiagonal, whiten, whiten_vjp
 
 # Of a weight; that of its prior is one, of which a sum with a larger one keeps fewer than seven digits.
@@ -100,11 +100,6 @@ class LinearEvidence:
         """Kullback-Leibler divergence of the weights' posterior from standard normal numbers, in nats."""
         trace = self.covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
         return 0.5 * (trace + self.mean.square().sum(-1) - self.mean.shape[-1]) + log_det(self.factor)
-
-
-def log_det(factor: Float[Tensor, "*b p p"]) -> Float[Tensor, "*b"]:
-    """Log determinants of triangular matrices, but for their signs."""
-    return factor.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
 
 
 def weights_factor(design: Tensor, response: Tensor) -> tuple[Tensor, Tensor]:
