@@ -6,9 +6,8 @@ import torch
 from scipy.stats import multivariate_normal
 from sklearn.gaussian_process.kernels import RBF
 
-from torch_pbd.gp.latent import LatentValues
 from torch_pbd.models import VARIANCE_FLOOR, with_floor
-from torch_pbd.models.costs import Likelihood
+from torch_pbd.models.costs import LatentValues, Likelihood
 from torch_pbd.models.links import CholeskyLink, WishartLink, padded
 from torch_pbd.models.training import TrainingSet
 from torch_pbd.optim.descent import minimize

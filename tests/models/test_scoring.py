@@ -3,10 +3,9 @@ import pytest
 import torch
 from scipy.optimize import minimize as scipy_minimize
 
-from torch_pbd.gp.latent import LatentValues
 from torch_pbd.linalg import scale_tril_from_root
 from torch_pbd.models import with_floor
-from torch_pbd.models.costs import Likelihood, train
+from torch_pbd.models.costs import LatentValues, Likelihood, train
 from torch_pbd.models.links import CholeskyLink, WishartLink, padded
 from torch_pbd.models.training import TrainingSet
 

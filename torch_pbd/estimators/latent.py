@@ -18,7 +18,6 @@ from torch_pbd.estimators.validation import warn_if_few, warn_if_identical
 from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.files.memory import require_much
 from torch_pbd.gp.evidence import EvidenceSearch
-from torch_pbd.gp.latent import LatentValues
 from torch_pbd.gp.observations import (
     Hyperparameters,
     LatentGP,
@@ -31,7 +30,7 @@ from torch_pbd.gp.observations import (
 from torch_pbd.gp.search import Found, Job, fit_together
 from torch_pbd.kernels import KERNELS, KernelName
 from torch_pbd.models.conditional import MeanAndCovariance
-from torch_pbd.models.costs import Likelihood, Solver, train
+from torch_pbd.models.costs import LatentValues, Likelihood, Solver, train
 from torch_pbd.models.links import Link
 from torch_pbd.models.training import TrainingSet
 from torch_pbd.optim.batch import FitReport

@@ -15,10 +15,9 @@ from torch import Tensor
 
 from torch_pbd.data import make_paper_simulation
 from torch_pbd.data.synthetic import paper_mean
-from torch_pbd.gp.latent import LatentValues
 from torch_pbd.kernels import correlation
 from torch_pbd.linalg import safe_cholesky, scale_tril_from_root
-from torch_pbd.models.costs import Likelihood, Solver, train
+from torch_pbd.models.costs import LatentValues, Likelihood, Solver, train
 from torch_pbd.models.links import CholeskyLink
 from torch_pbd.optim.batch import Progress
 from torch_pbd.optim.descent import minimize

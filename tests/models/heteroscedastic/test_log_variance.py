@@ -9,7 +9,7 @@ from torch.distributions import MultivariateNormal, kl_divergence
 
 from torch_pbd.models.heteroscedastic import log_variance
 from torch_pbd.models.heteroscedastic.log_variance import Squares
-from torch_pbd.models.heteroscedastic.whitening import NoiseCorrelation, bidiagonal
+from torch_pbd.models.heteroscedastic.regression import NoiseCorrelation, bidiagonal
 
 INDEPENDENT = None
 

@@ -5,9 +5,9 @@ from scipy.linalg import block_diag
 
 from torch_pbd.kernels import correlation
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily
+from torch_pbd.models.heteroscedastic.regression import NoiseCorrelation, bidiagonal
 from torch_pbd.models.heteroscedastic.search import Search, SearchOptions
 from torch_pbd.models.heteroscedastic.steps import fit_mean
-from torch_pbd.models.heteroscedastic.whitening import NoiseCorrelation, bidiagonal
 from torch_pbd.models.training import TrainingSet
 
 

@@ -4,8 +4,7 @@ import torch
 from scipy.linalg import block_diag
 from scipy.stats import multivariate_normal
 
-from torch_pbd.models.heteroscedastic.regression import Regression
-from torch_pbd.models.heteroscedastic.whitening import bidiagonal
+from torch_pbd.models.heteroscedastic.regression import Regression, bidiagonal
 
 # A ridge of 1e-8 beside the standardized outputs' scatter keeps it regular, and moves results by as much.
 RTOL = 1e-6

@@ -21,6 +21,7 @@ from torch_pbd.linalg import scale_tril_from_root
 from torch_pbd.models.heteroscedastic.log_variance import squares_within
 from torch_pbd.models.heteroscedastic.posterior import LatentCovariance, LatentMean
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily
+from torch_pbd.models.heteroscedastic.regression import NoiseCorrelation
 from torch_pbd.models.heteroscedastic.residuals import (
     LAGS,
     NOT_WHITE,
@@ -31,7 +32,6 @@ from torch_pbd.models.heteroscedastic.residuals import (
 )
 from torch_pbd.models.heteroscedastic.search import Families, Search, SearchOptions, on_stretched_inputs, stretched
 from torch_pbd.models.heteroscedastic.steps import MOST_INPUTS, CovarianceSearch, fit_covariance, fit_mean, mean_start
-from torch_pbd.models.heteroscedastic.whitening import NoiseCorrelation
 from torch_pbd.models.training import TrainingSet, pooled_tril
 from torch_pbd.optim.batch import Progress
 

@@ -12,8 +12,13 @@ from torch import Tensor
 
 from torch_pbd.linalg import log_det, safe_cholesky
 from torch_pbd.models.heteroscedastic.processes import Evidence, FixedFeatures, Gradient
-from torch_pbd.models.heteroscedastic.regression import LinearEvidence, weights_factor
-from torch_pbd.models.heteroscedastic.whitening import NoiseCorrelation, whiten, whiten_vjp
+from torch_pbd.models.heteroscedastic.regression import (
+    LinearEvidence,
+    NoiseCorrelation,
+    weights_factor,
+    whiten,
+    whiten_vjp,
+)
 from torch_pbd.models.training import TrainingSet
 
 LEAST_SQUARE = 1e-6

@@ -12,7 +12,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from torch_pbd.checks import ROUNDING
 from torch_pbd.linalg import safe_cholesky, triangular_inverse
-from torch_pbd.models.heteroscedastic.whitening import NoiseCorrelation, bidiagonal
+from torch_pbd.models.heteroscedastic.regression import NoiseCorrelation, bidiagonal
 from torch_pbd.models.training import TrainingSet
 
 LAGS = 3

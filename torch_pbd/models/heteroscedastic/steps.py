@@ -17,17 +17,19 @@ from torch_pbd.gp.evidence import EvidenceSearch, negative_log_evidence
 from torch_pbd.gp.observations import Hyperparameters, Observations, resolved_length_scale
 from torch_pbd.gp.search import fit_together
 from torch_pbd.linalg import triangular_inverse
-from torch_pbd.models.heteroscedastic.log_variance import (
-    LEAST_SQUARE,
-    Squares,
-    fit_log_variance,
-    log_variance_evidence,
-)
+from torch_pbd.models.heteroscedastic.log_variance import LEAST_SQUARE, Squares, fit_log_variance, log_variance_evidence
 from torch_pbd.models.heteroscedastic.posterior import LatentCovariance, LatentMean
 from torch_pbd.models.heteroscedastic.processes import CLEAR, FixedFeatures, Gradient, inducing_inputs
-from torch_pbd.models.heteroscedastic.regression import LinearEvidence, Regression, Weights
+from torch_pbd.models.heteroscedastic.regression import (
+    LinearEvidence,
+    NoiseCorrelation,
+    Regression,
+    Weights,
+    tridiagonal,
+    whiten,
+    whiten_vjp,
+)
 from torch_pbd.models.heteroscedastic.search import Families, Search, SearchOptions
-from torch_pbd.models.heteroscedastic.whitening import NoiseCorrelation, tridiagonal, whiten, whiten_vjp
 from torch_pbd.models.training import TrainingSet, pooled_tril
 
 MOST_INPUTS = 1024

@@ -5,9 +5,9 @@ import torch
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern
 
-from torch_pbd.gp.latent import LatentValues
 from torch_pbd.gp.observations import Hyperparameters, Observations, condition
 from torch_pbd.kernels import correlation
+from torch_pbd.models.costs import LatentValues
 
 LENGTH_SCALE = {1: [[0.2], [0.5]], 2: [[0.2, 1.0], [0.5, 0.3]]}
 AMPLITUDE, NOISE_SCALE = [1.5, 0.7], [0.2, 0.1]
