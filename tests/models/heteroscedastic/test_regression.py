@@ -27,8 +27,7 @@ class Rows:
 
 
 def fitted(regression, features):
-    weights = regression.fit(features[None]).weights
-    return type(weights)(weights.mean[0], weights.root[0])
+    return regression.weights(features[None])
 
 
 @pytest.mark.parametrize("i", [1, 2, 8])
@@ -67,9 +66,9 @@ def test_log_evidence_is_the_density_of_the_rows_but_for_what_no_features_change
     rows = Rows(rng, whitener=whitener_of(whitened), precision=precision)
     assert (rows.regression.couplings is None) == (whitened == "smooth")
     features = rng.normal(size=(4, 3, 5)) * np.geomspace(0.1, 3.0, 4)[:, np.newaxis, np.newaxis]
-    root = rows.regression.root.numpy()
+    mixing = rows.regression.mixing.numpy()
     if whitened:
-        before, response = root.transpose(0, 2, 1), rows.regression.response.numpy()
+        before, response = mixing, rows.regression.response.numpy()
         noise = np.kron(correlation, np.eye(2))
     else:
         before, response, noise = rows.before, rows.last, np.diag(np.repeat(1.0 / precision, 8))
@@ -77,7 +76,7 @@ def test_log_evidence_is_the_density_of_the_rows_but_for_what_no_features_change
     for phi in features:
         one = block_diag(*before) @ np.kron(phi, np.eye(2))
         expected.append(multivariate_normal(cov=noise + one @ one.T).logpdf(response.ravel()))
-    found = rows.regression.fit(torch.tensor(features)).value.numpy()
+    found = rows.regression.fit(torch.tensor(features).unsqueeze(1)).value.numpy()
     np.testing.assert_allclose(np.diff(found), np.diff(expected), rtol=RTOL, atol=RTOL)
 
 
@@ -122,16 +121,16 @@ def test_fewer_rows_than_outputs_leave_no_squares_and_do_not_fail(i, k, rng):
 def test_gradient_of_the_log_evidence_is_that_of_autograd(i, whitened, rng):
     known = Rows(rng, i=i, whitener=whitener_of(whitened), precision=[0.5, 2.0, 5.0]).regression
     features = torch.tensor(rng.normal(size=(2, 3, 4))).requires_grad_()
-    (expected,) = torch.autograd.grad(known.fit(features).value.sum(), features)
+    (expected,) = torch.autograd.grad(known.fit(features.unsqueeze(1)).value.sum(), features)
     with torch.no_grad():
-        found = known.gradient(known.fit(features), features)
+        found = known.gradient(known.fit(features.unsqueeze(1)), features)
     torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-8)
 
 
 def test_the_weights_are_those_of_the_design_whose_precision_is_too_large_to_form(rng):
     """By blocks up to where these lose the prior's digits, and by QR beyond: the same within what is left."""
     known = Rows(rng, precision=[0.5, 2.0, 5.0]).regression
-    features = torch.tensor(rng.normal(size=(1, 3, 2)))
+    features = torch.tensor(rng.normal(size=(1, 1, 3, 2)))
     by_blocks, by_design = (known.fit(scale * features) for scale in (1e3, 1e5))
     torch.testing.assert_close(by_blocks.mean / 1e2, by_design.mean, rtol=1e-5, atol=1e-10)
     both = known.fit(torch.cat([1e3 * features, 1e5 * features])).value  # all by the design, for the second

@@ -6,7 +6,7 @@ and W'W tridiagonal. W is stored as the matrix (n, n), n > 2; as its diagonal an
 a zero; or as its diagonal (n, 1).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -108,36 +108,6 @@ class LinearEvidence:
         """Posterior of the weights."""
         return Weights(self.mean, triangular_inverse(self.factor, upper=True))
 
-    @classmethod
-    def fit_blocks(
-        cls,
-        own: Float[Tensor, "n i i"],
-        beside: Float[Tensor, "m i i"],
-        features: Float[Tensor, "b i n p"],
-        response: Float[Tensor, "n i"],
-    ) -> "LinearEvidence | None":
-        """Evidence, but for y'y, of b sets of i processes; None where floating point cannot hold their precision.
-
-        The block of processes j and k in D'D is the sum over inputs l and l' of ``F_jl' c F_kl'``, with c from ``own``
-        where they are the same, from ``beside``, m of n - 1, where l' is the next, and zero else. The ``response`` is
-        D'y but for the features. By way of D, of i rows an input, this would be i times the work.
-        """
-        n_sets, size, n, n_features = features.shape
-        by_input, m, halves = features.transpose(1, 2), len(beside), []
-        for j in range(size):
-            right = 0.5 * own[:, j, :, None] * by_input
-            right[:, :m] += beside[:, j, :, None] * by_input[:, n - m :]
-            halves.append(features[:, j].mT @ right.flatten(2))
-        half = torch.stack(halves, dim=1).reshape(n_sets, size * n_features, -1)
-        precision = half + half.mT + torch.eye(size * n_features).to(half)
-        if float(precision.detach().diagonal(dim1=-2, dim2=-1).amax()) >= _LARGEST_PRECISION:
-            return None
-        factor = safe_cholesky(precision, name="the precision of the latent weights")
-        of_features = (response.mT.unsqueeze(1) @ features).flatten(1).unsqueeze(-1)
-        projected = torch.linalg.solve_triangular(factor, of_features, upper=False)
-        mean = torch.linalg.solve_triangular(factor.mT, projected, upper=True).squeeze(-1)
-        return cls(0.5 * projected.square().sum((-2, -1)) - log_det(factor), mean, factor.mT)
-
     def gradient(self, design: Float[Tensor, "*b n p"], response: Float[Tensor, "*b n"]) -> Float[Tensor, "*b n p"]:
         """Gradient of the value in the design: (y - D m) m' - D inv(P)."""
         residual = response.unsqueeze(-1) - design @ self.mean.unsqueeze(-1)
@@ -166,19 +136,115 @@ def weights_factor(design: Tensor, response: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @dataclass(frozen=True)
-class Regression:
-    """Regression of an output on the i standardized outputs before it, at n inputs, with coefficients (n, i).
+class MixedResponses:
+    """Responses at n inputs that mix i processes there, ``mixing @ values``, under noise of variance one.
 
-    ``root.mT @ coefficients`` is ``response`` but for noise of variance one, independent between the rows of the root:
-    sufficient statistics of the rows at an input.
+    The noise is independent between the r rows of an input, and between inputs once it is whitened.
+    """
+
+    mixing: Float[Tensor, "n r i"]
+    response: Float[Tensor, "n r"]
+    whitener: Float[Tensor, "#r n m"]
+    """W of each row, or of all."""
+
+    @cached_property
+    def whitened(self) -> Float[Tensor, "r n 1"]:
+        """Responses multiplied by W."""
+        return whiten(self.whitener, self.response.mT.unsqueeze(-1))
+
+    @cached_property
+    def cross(self) -> Float[Tensor, "n i"]:
+        """Product of the rows at each input with the responses at all, weighted by W'W."""
+        weighted = whiten_vjp(self.whitener, self.whitened).transpose(0, 1)
+        return (self.mixing.mT @ weighted).squeeze(-1)
+
+    @cached_property
+    def couplings(self) -> tuple[Float[Tensor, "n i i"], Float[Tensor, "m i i"]] | None:
+        """Products of the rows at one input and, m of n - 1, at one and the next, weighted by W'W.
+
+        None where inputs are coupled with others too.
+        """
+        if (weights := tridiagonal(self.whitener)) is None:
+            return None
+        own, beside = (part.mT.unsqueeze(-1) for part in weights)
+        first, after = self.mixing[: len(beside)], self.mixing[len(self.mixing) - len(beside) :]
+        return self.mixing.mT @ (own * self.mixing), first.mT @ (beside * after)
+
+    def design(self, features: Float[Tensor, "b #i n p"]) -> tuple[Float[Tensor, "b rn ip"], Float[Tensor, "b rn"]]:
+        """Design of the whitened rows, and their responses."""
+        features = features.expand(-1, self.mixing.shape[2], -1, -1)
+        design = torch.einsum("nri,binp->brnip", self.mixing, features).flatten(3)
+        return whiten(self.whitener, design).flatten(1, 2), self.whitened.flatten().expand(len(design), -1)
+
+    def fit(self, features: Float[Tensor, "b #i n p"]) -> LinearEvidence:
+        """Posterior of the weights of b sets of features, one process after another, with its log evidence.
+
+        The block of processes j and k in D'D is the sum over inputs l and l' of ``F_jl' c F_kl'``, c their coupling. By
+        way of the design D, of r rows an input, which it takes where floating point cannot hold the precision or
+        couplings are too many, this would be r times the work.
+        """
+        if self.couplings is None:
+            return LinearEvidence.fit(*self.design(features))
+        (own, beside), size = self.couplings, self.mixing.shape[2]
+        by_input, m = features.expand(-1, size, -1, -1).transpose(1, 2), len(beside)
+        halves = []
+        for j in range(size):
+            right = 0.5 * own[:, j, :, None] * by_input
+            right[:, :m] += beside[:, j, :, None] * by_input[:, len(own) - m :]
+            halves.append(by_input[:, :, j].mT @ right.flatten(2))
+        half = torch.stack(halves, dim=1).flatten(1, 2)
+        precision = half + half.mT + torch.eye(half.shape[-1]).to(half)
+        if float(precision.detach().diagonal(dim1=-2, dim2=-1).amax()) >= _LARGEST_PRECISION:
+            return LinearEvidence.fit(*self.design(features))
+        factor = safe_cholesky(precision, name="the precision of the latent weights")
+        of_features = (self.cross.mT.unsqueeze(1) @ by_input.transpose(1, 2)).flatten(1).unsqueeze(-1)
+        projected = torch.linalg.solve_triangular(factor, of_features, upper=False)
+        mean = torch.linalg.solve_triangular(factor.mT, projected, upper=True).squeeze(-1)
+        # Less y'y, as of the design, or values of a search would jump where digits end.
+        square = projected.square().sum((-2, -1)) - self.whitened.square().sum()
+        return LinearEvidence(0.5 * square - log_det(factor), mean, factor.mT)
+
+    def weights(self, features: Float[Tensor, "#i n p"]) -> Weights:
+        """Posterior of the weights of one set of features."""
+        mean, root = self.fit(features.unsqueeze(0)).weights
+        return Weights(mean[0], root[0])
+
+    def gradient(self, linear: LinearEvidence, features: Float[Tensor, "b n p"]) -> Float[Tensor, "b n p"]:
+        """Gradient of the log evidence in the features that all processes share.
+
+        With the mean m and the precision P = I + X of the weights, and their inner products c with the response, it is
+        that of ``m' c - tr((inv(P) + m m') X) / 2``: block (j, k) of X is the sum over coupled inputs l and r of
+        ``weight_jk F_l F_r'``.
+        """
+        n_rows, size = self.mixing.shape[1:]
+        if self.couplings is None:
+            gradient = linear.gradient(*self.design(features.unsqueeze(1))).unflatten(1, (n_rows, -1))
+            gradient = whiten_vjp(self.whitener, gradient).unflatten(3, (size, -1))
+            return torch.einsum("nri,brnip->bnp", self.mixing, gradient)
+        own, beside = (part.flatten(1).unsqueeze(1) for part in self.couplings)
+        after, n = self.couplings[1].mT.flatten(1).unsqueeze(1), len(beside)
+        second = linear.covariance + linear.mean.unsqueeze(-1) * linear.mean.unsqueeze(-2)
+        in_features = []
+        for mean, its_second, its_features in zip(linear.mean, second, features, strict=True):  # bounds the memory
+            spread = _spread(its_second, its_features)
+            weighted = own @ spread
+            weighted[:n] += beside @ spread[len(spread) - n :]
+            weighted[len(spread) - n :] += after @ spread[:n]
+            in_features.append(self.cross @ mean.reshape(size, -1) - weighted.squeeze(1))
+        return torch.stack(in_features)
+
+
+@dataclass(frozen=True)
+class Regression(MixedResponses):
+    """Regression of an output on the i standardized outputs before it, at n inputs: coefficients are the processes.
+
+    The mixing and the response are sufficient statistics of the rows at an input.
     """
 
     scatter: Float[Tensor, "n j j"]
     """Scatter of the i standardized outputs and, last, the output: j = i + 1."""
     precision: Float[Tensor, " n"]
     """Expected inverse of the output's conditional variance."""
-    whitener: Float[Tensor, "n m"]
-    """W, that makes the rows at different inputs independent."""
 
     @classmethod
     def standardize(
@@ -193,106 +259,34 @@ class Regression:
         # diag(inv(T), 1) S diag(inv(T), 1)': the outputs before get unit covariance, the last one keeps its unit.
         standardizing = torch.eye(size + 1).to(scatter).repeat(len(scatter), 1, 1)
         standardizing[:, :size, :size] = triangular_inverse(tril)
-        return cls(symmetrize(standardizing @ scatter @ standardizing.mT), precision, whitener)
-
-    @property
-    def size(self) -> int:
-        """Number i of outputs before."""
-        return self.scatter.shape[-1] - 1
-
-    @cached_property
-    def before(self) -> Float[Tensor, "n i i"]:
-        """Scatter of the i standardized outputs."""
-        return self.scatter[:, :-1, :-1] + _RIDGE * torch.eye(self.size).to(self.scatter)
-
-    @cached_property
-    def root(self) -> Float[Tensor, "n i i"]:
-        """Lower factor of the scatter of the i outputs times the precision."""
-        factor = safe_cholesky(self.before, name="the scatter of the outputs")
-        return self.precision.sqrt()[:, None, None] * factor
-
-    @cached_property
-    def response(self) -> Float[Tensor, "n i"]:
-        """Output at the root's rows: ``inv(root)`` times its scatter with the others and the precision."""
-        cross = self.precision[:, None, None] * self.scatter[:, :-1, -1:]
-        return torch.linalg.solve_triangular(self.root, cross, upper=False).squeeze(-1)
-
-    @cached_property
-    def cross(self) -> Float[Tensor, "n i"]:
-        """Product of the root's rows at each input with the responses at all, weighted by W'W."""
-        weighted = whiten_vjp(self.whitener, whiten(self.whitener, self.response))
-        return (self.root @ weighted.unsqueeze(-1)).squeeze(-1)
-
-    @cached_property
-    def couplings(self) -> tuple[Float[Tensor, "n i i"], Float[Tensor, "m i i"]] | None:
-        """Products of the root's rows at one input and, m of n - 1, at one and the next, weighted by W'W.
-
-        None where inputs are coupled with others too.
-        """
-        if (weights := tridiagonal(self.whitener)) is None:
-            return None
-        (own, beside), n = weights, len(self.root)
-        after = self.root[n - len(beside) :].mT
-        return own[:, None, None] * (self.root @ self.root.mT), beside[:, None, None] * (
-            self.root[: len(after)] @ after
-        )
-
-    def fit(self, features: Float[Tensor, "b n p"]) -> LinearEvidence:
-        """Posterior of the weights of b sets of features, one coefficient after another, with its log evidence."""
-        if self.couplings is not None:
-            of_each = features.unsqueeze(1).expand(-1, self.size, -1, -1)
-            if (linear := LinearEvidence.fit_blocks(*self.couplings, of_each, self.cross)) is not None:
-                # Less y'y, as of the design, or values of a search would jump where digits end.
-                return replace(linear, value=linear.value - 0.5 * whiten(self.whitener, self.response).square().sum())
-        return LinearEvidence.fit(*self._design(features))
-
-    def gradient(self, linear: LinearEvidence, features: Float[Tensor, "b n p"]) -> Float[Tensor, "b n p"]:
-        """Gradient of the log evidence in the features.
-
-        With the mean m and the precision P = I + X of the weights, and their inner products c with the response, it is
-        that of ``m' c - tr((inv(P) + m m') X) / 2``: block (j, k) of X is the sum over coupled inputs l and r of
-        ``weight_jk F_l F_r'``.
-        """
-        if self.couplings is None:
-            gradient = linear.gradient(*self._design(features)).unflatten(1, (-1, self.size)).flatten(2)
-            gradient = whiten_vjp(self.whitener, gradient).unflatten(2, (self.size, self.size, -1))
-            return torch.einsum("nja,bnajp->bnp", self.root, gradient)
-        own, beside = (part.flatten(1).unsqueeze(1) for part in self.couplings)
-        after, n = self.couplings[1].mT.flatten(1).unsqueeze(1), len(beside)
-        second = linear.covariance + linear.mean.unsqueeze(-1) * linear.mean.unsqueeze(-2)
-        in_features = []
-        for mean, its_second, its_features in zip(linear.mean, second, features, strict=True):  # bounds the memory
-            spread = self._spread(its_second, its_features)
-            weighted = own @ spread
-            weighted[:n] += beside @ spread[len(spread) - n :]
-            weighted[len(spread) - n :] += after @ spread[:n]
-            in_features.append(self.cross @ mean.reshape(self.size, -1) - weighted.squeeze(1))
-        return torch.stack(in_features)
+        scatter = symmetrize(standardizing @ scatter @ standardizing.mT)
+        # Times the precision the scatter of the outputs before is R R', and that with the output R times the response.
+        before = scatter[:, :size, :size] + _RIDGE * torch.eye(size).to(scatter)
+        factor = safe_cholesky(before, name="the scatter of the outputs")
+        root = precision.sqrt()[:, None, None] * factor
+        cross = precision[:, None, None] * scatter[:, :size, size:]
+        response = torch.linalg.solve_triangular(root, cross, upper=False).squeeze(-1)
+        return cls(root.mT, response, whitener.unsqueeze(0), scatter, precision)
 
     def expected_squares(
         self, features: Float[Tensor, "n p"], mean: Float[Tensor, " ip"], covariance: Float[Tensor, "ip ip"]
     ) -> Float[Tensor, " n"]:
         """Expected sum of squared residuals, with the weights' mean and covariance."""
         # With coefficients b the sum of squares is (-b, 1) S (-b, 1)', and tr(before cov(b)) what their error adds.
-        coefficients = features @ mean.reshape(self.size, -1).mT
+        coefficients = features @ mean.reshape(-1, features.shape[1]).mT
         direction = torch.cat([-coefficients, torch.ones_like(coefficients[:, :1])], dim=1)
         explained = (direction.unsqueeze(1) @ self.scatter @ direction.unsqueeze(2)).flatten()
-        spread = self.before.flatten(1).unsqueeze(1) @ self._spread(covariance, features)
-        return explained.clamp_min(0.0) + (spread.squeeze(1) * features).sum(-1)
+        spread = (self.mixing.mT @ self.mixing).flatten(1).unsqueeze(1) @ _spread(covariance, features)
+        return explained.clamp_min(0.0) + (spread.squeeze(1) * features).sum(-1) / self.precision
 
     def local_squares(self) -> Float[Tensor, " n"]:
         """Sum of squared residuals from the coefficients that fit best at each input by itself."""
         return (self.scatter[:, -1, -1] - self.response.square().sum(-1) / self.precision).clamp_min(0.0)
 
-    def _spread(self, covariance: Tensor, features: Tensor) -> Float[Tensor, "n ii p"]:
-        """Each block of a covariance of the weights times the features (n, p) of each input."""
-        size, n_features = self.size, features.shape[-1]
-        blocks = covariance.reshape(size, n_features, size, n_features).permute(3, 0, 2, 1)
-        return (features @ blocks.flatten(1)).unflatten(-1, (size * size, n_features))
 
-    def _design(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Design (b, n * i, i * p) of the rows of the root at each input, whitened, and the response."""
-        # Row a at an input holds root_ja F for each coefficient j: n i rows, of which the whitener mixes the inputs.
-        design = torch.einsum("nja,bnp->bnajp", self.root, features).flatten(2)
-        response = whiten(self.whitener, self.response).flatten().expand(len(design), -1)
-        return whiten(self.whitener, design).unflatten(2, (self.size, -1)).flatten(1, 2), response
+def _spread(covariance: Float[Tensor, "ip ip"], features: Float[Tensor, "n p"]) -> Float[Tensor, "n ii p"]:
+    """Each block of a covariance of the weights times the features of each input."""
+    n_features = features.shape[-1]
+    size = len(covariance) // n_features
+    blocks = covariance.reshape(size, n_features, size, n_features).permute(3, 0, 2, 1)
+    return (features @ blocks.flatten(1)).unflatten(-1, (size * size, n_features))

@@ -22,10 +22,10 @@ from torch_pbd.models.heteroscedastic.posterior import LatentCovariance, LatentM
 from torch_pbd.models.heteroscedastic.processes import CLEAR, FixedFeatures, Gradient, inducing_inputs
 from torch_pbd.models.heteroscedastic.regression import (
     LinearEvidence,
+    MixedResponses,
     NoiseCorrelation,
     Regression,
     Weights,
-    tridiagonal,
     whiten,
     whiten_vjp,
 )
@@ -78,27 +78,8 @@ def fit_mean(
     processes = search.family.prepared(search.run(evidence))
     # All outputs: sqrt(count) inv(T) mean, with T the factor of the noise, has independent entries at an input.
     whitening = counts.sqrt()[:, None, None] * triangular_inverse(noise_tril)
-    return LatentMean(processes, _fit_outputs(processes(rows.inputs), whitening, means, whitener).weights)
-
-
-def _fit_outputs(
-    features: Float[Tensor, "d n p"],
-    whitening: Float[Tensor, "n d d"],
-    means: Float[Tensor, "n d"],
-    whitener: Float[Tensor, "d n m"],
-) -> LinearEvidence:
-    """Posterior of the weights of all outputs together."""
-    response = whiten(whitener, (whitening @ means.unsqueeze(-1)).transpose(0, 1))
-    if (weights := tridiagonal(whitener)) is not None:
-        own, beside = (part.mT.unsqueeze(-1) * whitening[len(whitening) - part.shape[1] :] for part in weights)
-        first = whitening[: len(beside)]
-        weighted = whiten_vjp(whitener, response).transpose(0, 1)
-        cross = (whitening.mT @ weighted).squeeze(-1)
-        linear = LinearEvidence.fit_blocks(whitening.mT @ own, first.mT @ beside, features.unsqueeze(0), cross)
-        if linear is not None:
-            return LinearEvidence(linear.value[0], linear.mean[0], linear.factor[0])
-    design = torch.einsum("nij,jnp->injp", whitening, features).flatten(2)
-    return LinearEvidence.fit(whiten(whitener, design).flatten(0, 1), response.flatten())
+    responses = MixedResponses(whitening, (whitening @ means.unsqueeze(-1)).squeeze(-1), whitener)
+    return LatentMean(processes, responses.weights(processes(rows.inputs)))
 
 
 def mean_start(
@@ -198,10 +179,9 @@ def fit_covariance(
     log_variances = search.log_variance.family.prepared(theta)
     weights = fit_log_variance(squares, log_variances(inputs), log_variance.location).posterior.weights
     thetas = [each.theta for each in search.coefficients if each.theta is not None]
-    rows, coefficients = search.coefficient_family.prepared(torch.cat([theta[:0], *thetas])), []
-    for regression, features in zip(regressions, rows(inputs), strict=True):
-        mean, root = regression.fit(features[None]).weights
-        coefficients.append(Weights(mean[0], root[0]))
+    rows = search.coefficient_family.prepared(torch.cat([theta[:0], *thetas]))
+    of_regressions = zip(regressions, rows(inputs).unsqueeze(1), strict=True)
+    coefficients = [regression.weights(features) for regression, features in of_regressions]
     return LatentCovariance(log_variances, weights, rows, coefficients), evidence
 
 
@@ -247,14 +227,14 @@ def _searched_row(
     searches: list[Search], fixed: FixedFeatures, i: int, regression: Regression, *, anew: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Coefficients of output i, their hyperparameters searched anew or kept."""
-    search, information = searches[i - 1], regression.root.square().sum()[None]
+    search, information = searches[i - 1], regression.mixing.square().sum()[None]
 
     def evidence(theta: Tensor, rows: Tensor) -> tuple[Tensor, Gradient]:
         design, vjp = fixed.design_vjp(theta, information[rows])
-        linear = regression.fit(design)
+        linear = regression.fit(design.unsqueeze(1))
         return linear.value, lambda: vjp(regression.gradient(linear, design))
 
     theta = search.run(evidence) if anew or search.theta is None else search.theta
     design, _ = fixed.design_vjp(theta, information)
-    linear = regression.fit(design)
+    linear = regression.fit(design.unsqueeze(1))
     return design[0], linear.mean[0], linear.covariance[0], linear.divergence_from_prior()
