@@ -25,6 +25,12 @@ def symmetrize(matrix: Float[Tensor, "*b d d"]) -> Float[Tensor, "*b d d"]:
     return 0.5 * (matrix + matrix.mT)
 
 
+def block_matrix(first: Tensor, upper: Tensor, lower: Tensor, last: Tensor) -> Float[Tensor, "*b d2 d2"]:
+    """Matrices ``[[first, upper], [lower, last]]`` of blocks that broadcast."""
+    first, upper, lower, last = torch.broadcast_tensors(first, upper, lower, last)
+    return torch.cat([torch.cat([first, upper], dim=-1), torch.cat([lower, last], dim=-1)], dim=-2)
+
+
 def broadcast_shapes(*shapes: torch.Size) -> torch.Size:
     """Shape that all broadcast to, as ``torch.broadcast_shapes`` has it, which loads sympy: a third of a second."""
     return torch.broadcast_tensors(*(torch.empty(()).expand(shape) for shape in shapes))[0].shape

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from torch_pbd.linalg import symmetrize
+from torch_pbd.linalg import block_matrix, symmetrize
 
 # Share of the damping below which entries between the modes of the stiffness are rounding of its root.
 _COUPLED = 1e-12
@@ -91,8 +91,7 @@ def _held(frequency: Float[Tensor, "k d"], damping: Float[Tensor, "k d *d"], ste
     """Exponentials of ``[[0, w], [-w, -D]]`` over these steps: of each mode by itself where none is coupled."""
     if damping.ndim == 3:
         across = torch.diag_embed(frequency)
-        upper = torch.cat([torch.zeros_like(across), across], dim=-1)
-        return torch.linalg.matrix_exp(torch.cat([upper, torch.cat([-across, -damping], dim=-1)], dim=-2) * step)
+        return torch.linalg.matrix_exp(block_matrix(torch.zeros_like(across), across, -across, -damping) * step)
     rate = torch.stack([torch.zeros_like(frequency), frequency, -frequency, -damping], dim=-1).unflatten(-1, (2, 2))
     blocks = torch.linalg.matrix_exp(rate * step[..., None])  # (k, d, 2, 2)
     return torch.diag_embed(blocks.movedim(1, -1)).movedim(-2, -3).flatten(-2).flatten(-3, -2)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torch_pbd.control.stability.dynamics import ErrorDynamics
 from torch_pbd.control.stability.report import GROWTH_ROUNDING
-from torch_pbd.linalg import evenly, least_eigenvalue, rows_below, smallest_eigenvalues, symmetrize
+from torch_pbd.linalg import block_matrix, evenly, least_eigenvalue, rows_below, smallest_eigenvalues, symmetrize
 
 # Intervals among which a minimum over all is searched at a time: more change nothing, fewer need more rounds.
 _N_WORST = 16
@@ -113,15 +113,7 @@ class Knots:
         first = (still * alpha + function) * stiffness + function * alpha * damping
         last = still * damping + (function - still * alpha) * mass - mass_rate
         cross = alpha * (function * mass - coupling_rate)
-        return _blocks(first - stiffness_rate - alpha * damping_rate, cross, last)
-
-
-def _blocks(first: Tensor, cross: Tensor, last: Tensor) -> Tensor:
-    """Matrices ``[[first, cross], [cross', last]]``."""
-    d = last.shape[-1]
-    whole = first.new_empty(*first.shape[:-2], 2 * d, 2 * d)
-    whole[..., :d, :d], whole[..., d:, d:], whole[..., :d, d:], whole[..., d:, :d] = first, last, cross, cross.mT
-    return whole
+        return block_matrix(first - stiffness_rate - alpha * damping_rate, cross, cross.mT, last)
 
 
 def _at_points(matrix: Float[Tensor, "n d d"], is_turning: bool) -> Float[Tensor, "c k d d"]:
@@ -213,7 +205,7 @@ def held_growth(dynamics: ErrorDynamics, maps: Float[Tensor, "k s s"], alpha: fl
     delayed, across = lag[:, :, None] * damping * lag[:, None, :], torch.diag_embed(lag)
     growths = []
     for each in (alpha, alpha / 2.0, alpha / 4.0):
-        function = _blocks(identity + each * delayed, each * across, identity)
+        function = block_matrix(identity + each * delayed, each * across, each * across, identity)
 
         def pencil(rows: Tensor, q: float, p: float, function: Tensor = function) -> Tensor:
             return p * function[rows] - q * maps[rows].mT @ function[rows + 1] @ maps[rows]

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch_pbd import checks
 from torch_pbd.control.matrices import as_mass, as_semidefinite, damping_from_stiffness, masses_like
 from torch_pbd.exceptions import InvalidParameterError
-from torch_pbd.linalg import spectral_map, symmetrize
+from torch_pbd.linalg import block_matrix, spectral_map, symmetrize
 
 # Largest stiffness before clipping, as a multiple of the limit: axes without variance would be infinitely stiff. Those
 # stiffer than a million times the limit are clipped to it anyway, and leave ten digits to the others.
@@ -111,8 +111,7 @@ def lqt(
     # geometric mean, and so equals the damping of ratio 1/2 for the stiffness Sigma^-1 / r.
     stiffness = damping_from_stiffness(precision / r, masses, 0.5)
     damping = damping_from_stiffness(stiffness, masses, 0.5**0.5)
-    whole = torch.cat([stiffness @ lightness @ damping, stiffness], dim=-1)
-    cost = r * torch.cat([whole, torch.cat([stiffness, damping], dim=-1)], dim=-2)
+    cost = r * block_matrix(stiffness @ lightness @ damping, stiffness, stiffness, damping)
     if horizon is None:
         for row in range(n - 2, -1, -1):
             cost[row] = _before(cost[row + 1], back[row])
