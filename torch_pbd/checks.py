@@ -27,6 +27,7 @@ ROUNDING = 1e-9
 """Relative: what is smaller counts as rounding of the caller's arithmetic. float64 itself makes errors of 1e-13 in
 matrices of a hundred rows; files of ten digits make 1e-10."""
 
+_NEARLY_UNIT = 1e-6  # of squared norms: quaternions of seven digits pass as unit ones
 _SINGULAR = 1e-14  # an eigenvalue of correlations that rounding alone can make
 _MOST = 2**53  # whole numbers above it are not all floats
 _LONGEST = 80  # letters of a value that are shown
@@ -154,6 +155,14 @@ def require(
         index = tuple(map(int, np.argwhere(~good)[0]))
         where = f"{name}[{', '.join(map(str, index))}]" if index else name
         raise refusal(values[index], where, must, remedy, unit)
+
+
+def unit_quaternions(quaternions: NDArray[Any], name: str) -> Floats:
+    """Squared norms (...,) of quaternions (..., 4), refused where they are not 1 to seven digits."""
+    squared = np.sum(quaternions**2, axis=-1)
+    good, remedy = np.abs(squared - 1.0) <= _NEARLY_UNIT, "give unit quaternions w x y z"
+    require(good, squared, f"the squared norm of {name}", "1", remedy)
+    return squared
 
 
 def symmetric(matrices: NDArray[Any], name: str) -> Floats:

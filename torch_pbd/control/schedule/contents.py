@@ -31,8 +31,7 @@ OPTIONAL = frozenset({"acceleration", "orientation", "mass"})
 
 LABELS = ("names", "units", "frame", "stiffness_limits", "covariance_of", "mass", "provenance")
 
-# Tolerances of the squared norm: quaternions rounded to seven digits pass as unit ones and are normalized to rounding.
-_NEARLY_UNIT, _UNIT = 1e-6, 1e-14
+_UNIT = 1e-14  # rounding of the squared norm, to which quaternions are normalized
 # Deepest nesting of labels, which JSON's reader and Python's stack exceed on every system.
 _DEEPEST = 100
 
@@ -70,22 +69,16 @@ def checked_fields(fields: Mapping[str, Any]) -> dict[str, Any]:
         checks.semidefinite(arrays[name], name, definite=name == "mass")
         arrays[name] = 0.5 * (arrays[name] + arrays[name].swapaxes(1, 2))
     if "orientation" in arrays:
-        arrays["orientation"] = _checked_orientation(arrays["orientation"])
+        orientation, squared = arrays["orientation"], checks.unit_quaternions(arrays["orientation"], "orientation")
+        off = np.abs(squared - 1.0) > _UNIT
+        orientation[off] /= np.sqrt(squared[off])[:, np.newaxis]
+        arrays["orientation"] = rotations.continuous(orientation)
     limits = _checked_limits(fields["stiffness_limits"], arrays["stiffness"])
     _check_held(arrays["stiffness"], arrays["damping"])
     for array in arrays.values():
         array.setflags(write=False)
     labels = _checked_labels({**fields, "mass": mass if of_rows is None else None}, sizes["d"])
     return {**labels, **arrays, "stiffness_limits": limits}
-
-
-def _checked_orientation(orientation: Floats) -> Floats:
-    squared = np.sum(orientation**2, axis=1)
-    remedy = "give unit quaternions w x y z"
-    checks.require(np.abs(squared - 1.0) <= _NEARLY_UNIT, squared, "the squared norm of orientation", "1", remedy)
-    off = np.abs(squared - 1.0) > _UNIT
-    orientation[off] /= np.sqrt(squared[off])[:, np.newaxis]
-    return rotations.continuous(orientation)
 
 
 def _checked_limits(limits: Any, stiffness: Floats) -> Limits | None:

@@ -33,8 +33,6 @@ _SHAPES = {
     "orientation0": "4",
     "velocity0": "d",
 }
-# Tolerance of the squared norms of unit quaternions, as in schedules: those of seven digits pass.
-_NEARLY_UNIT = 1e-6
 
 
 @final
@@ -221,6 +219,4 @@ def _check(given: dict[str, Tensor]) -> None:
             continue
         checks.require(torch.isfinite(plain).numpy(), plain.numpy(), name, "finite")
         if name.startswith("orientation"):
-            squared = plain.square().sum(-1).numpy()
-            good, remedy = abs(squared - 1.0) <= _NEARLY_UNIT, "give unit quaternions w x y z"
-            checks.require(good, squared, f"the squared norm of {name}", "1", remedy)
+            checks.unit_quaternions(plain.numpy(), name)
