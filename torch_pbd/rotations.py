@@ -2,7 +2,8 @@
 
 Quaternions (..., 4) turn vectors of the body, a tool, into vectors of the world; rotation vectors (..., 3) are in rad.
 NumPy alone is imported, for schedules and the control loop: tests compare it with ``scipy.spatial.transform``, which
-has the same. `multiply`, `exp`, `between` and `cross_matrix` take torch's tensors too, from the simulated robot.
+has the same. `multiply`, `exp`, `between`, `cross_matrix` and `of_last_axes` take torch's tensors too, from the
+simulated robot.
 """
 
 import math
@@ -102,6 +103,15 @@ def cross_matrix(vector: Array) -> Array:
     x, y, z = (vector[..., i] for i in range(3))
     zero = 0.0 * x
     return library_of(vector).stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*vector.shape, 3)
+
+
+def of_last_axes(matrix: Array, d: int) -> Array:
+    """Matrix (..., d, d) that acts as one (..., 3, 3) on the last three of d components, and leaves the others."""
+    library = library_of(matrix)
+    whole = library.zeros((*matrix.shape[:-2], d, d), dtype=matrix.dtype, device=matrix.device)
+    whole[..., : d - 3, : d - 3] = library.eye(d - 3)
+    whole[..., d - 3 :, d - 3 :] = matrix
+    return whole
 
 
 def left_jacobian(vector: Floats) -> Floats:

@@ -9,12 +9,12 @@ from sklearn.utils.validation import check_is_fitted
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.control.learning import as_demonstrations, fit_covariance, fit_law, law_for, outputs_of
+from torch_pbd.control.learning import as_demonstrations, fit_covariance, fit_law, law_for
 from torch_pbd.control.matrices import as_damping_ratio, as_mass
 from torch_pbd.control.planning import Planning
 from torch_pbd.control.primitive import smoothing
 from torch_pbd.control.primitive.dmp import Adaptation, Gate
-from torch_pbd.control.primitive.outputs import Outputs
+from torch_pbd.control.primitive.outputs import outputs_of
 from torch_pbd.control.primitive.reproduction import Reproduction, primitive
 from torch_pbd.control.stiffness import StiffnessLaw
 from torch_pbd.data import Demonstrations
@@ -166,7 +166,7 @@ class DMPController(Planning):
         shown = smoothing.merge_bursts(as_demonstrations(X, y, groups))
         self.names_, self.frame_, self.units_, self.time_unit_ = shown.names, shown.frame, shown.units, shown.time_unit
         self.n_demos_, self.n_outputs_ = len(shown), shown.n_outputs
-        outputs = outputs_of(shown)
+        outputs = outputs_of(self.n_outputs_, self.units_, shown.rotation_reference)
         law = law_for(self, outputs)
         self.duration_, self.time_scale_ = smoothing.duration_of(shown, self.duration)
         self.start_time_ = smoothing.common_start(shown)
@@ -282,9 +282,7 @@ class DMPController(Planning):
                 if len(value) != d:
                     raise ValueError(f"{name} has {len(value)} entries, must have {d}")
                 setattr(self, name, tuple(value))
-        n_positions = d if reference is None else d - 3
-        units = None if self.units_ is None else self.units_[:n_positions]
-        self.outputs_ = Outputs(n_positions, units, reference, axes)
+        self.outputs_ = outputs_of(d, self.units_, reference, axes)
         self.law_.blocks(d)
         for name in (*_NOISE, "unsampled_"):
             setattr(self, name, own[name])

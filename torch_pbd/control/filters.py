@@ -17,7 +17,7 @@ from typing import Any, final
 
 from torch_pbd import checks
 from torch_pbd.exceptions import InvalidParameterError
-from torch_pbd.rotations import library_of
+from torch_pbd.rotations import library_of, of_last_axes
 
 # A tensor, or an array of NumPy.
 Array = Any
@@ -155,10 +155,7 @@ class ActiveFilter(ABC):
     def carry(self, turn: Array) -> None:
         """Rotate the gains with the desired orientation, by a matrix (..., 3, 3), at the end of a tick."""
         stiffness, damping, share = self.gains
-        library, d = library_of(turn), stiffness.shape[-1]
-        whole = library.zeros((*turn.shape[:-2], d, d), dtype=turn.dtype, device=turn.device)
-        whole[..., : d - 3, : d - 3] = library.eye(d - 3)
-        whole[..., d - 3 :, d - 3 :] = turn
+        whole = of_last_axes(turn, stiffness.shape[-1])
         turned = [whole @ gain @ whole.mT for gain in (stiffness, damping)]
         self._turn, self.gains = whole, (*(0.5 * (gain + gain.mT) for gain in turned), share)
 

@@ -11,7 +11,7 @@ from sklearn.base import BaseEstimator, clone
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control.matrices import damping_from_stiffness
-from torch_pbd.control.primitive.outputs import RESOLUTION, Outputs
+from torch_pbd.control.primitive.outputs import RESOLUTION, Outputs, outputs_of
 from torch_pbd.control.primitive.smoothing import UNKNOWN
 from torch_pbd.control.stiffness import RotationLimits, StiffnessLaw
 from torch_pbd.data import Demonstrations, check_unimodal
@@ -57,7 +57,7 @@ def as_demonstrations(X: Demonstrations | ArrayLike, y: ArrayLike | None, groups
         )
     check_unimodal(demonstrations)
     if isinstance(X, Demonstrations):  # arrays have no units: they are in m and s
-        _warn_of_units(outputs_of(X))
+        _warn_of_units(outputs_of(X.n_outputs, X.units, X.rotation_reference))
     if demonstrations.alignment == "dtw":
         checks.warn(TIMING_REMOVED)
     return demonstrations
@@ -135,13 +135,6 @@ def fit_covariance(
 def _prior_of_coordinates(prior: Any, inverse: Floats, X: Floats) -> Floats:
     """Prior at inputs X of the coordinates that are learned, from one of the outputs."""
     return inverse @ prior_covariance(prior, X, len(inverse)) @ inverse.T
-
-
-def outputs_of(demonstrations: Demonstrations) -> Outputs:
-    """Outputs of demonstrations; the axes in which they are learned are not known yet."""
-    units, reference = demonstrations.units, demonstrations.rotation_reference
-    n_positions = demonstrations.n_outputs - (0 if reference is None else 3)
-    return Outputs(n_positions, None if units is None else units[:n_positions], reference)
 
 
 def law_for(controller: Any, outputs: Outputs) -> StiffnessLaw:

@@ -13,7 +13,7 @@ from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.data.poses import FURTHEST
 from torch_pbd.data.units import ANGLES, LENGTHS
-from torch_pbd.rotations import Chart
+from torch_pbd.rotations import Chart, of_last_axes
 
 RESOLUTION = 1e-5
 """Share of a movement's extent, for rotations of a radian, below which standard deviations count as none."""
@@ -119,12 +119,9 @@ class Outputs:
         """
         if self.axes is None:
             return learned
-        turn = self.axes
-        if path is not None:
-            p = self.n_positions
-            to_world = np.tile(np.eye(p + 3), (len(path), 1, 1))  # Jacobian of small changes of outputs
-            to_world[:, p:, p:] = self._chart.to_world(path[:, p:])
-            turn = to_world @ turn
+        turn, p = self.axes, self.n_positions
+        if path is not None:  # by the Jacobian of small changes of outputs
+            turn = of_last_axes(self._chart.to_world(path[:, p:]), p + 3) @ turn
         whole = turn @ learned @ np.swapaxes(turn, -1, -2)
         whole = 0.5 * (whole + np.swapaxes(whole, -1, -2))
         if not cross_terms:
@@ -181,6 +178,12 @@ class Outputs:
         if (free.any(axis=-1) != free.all(axis=-1)).any():
             raise ValueError(f"{name} has a part of the rotation, must have all of it, or NaN for all of it.")
         return given
+
+
+def outputs_of(d: int, units: Sequence[str] | None, reference: Floats | None, axes: Floats | None = None) -> Outputs:
+    """Outputs of d columns with their units, the last three a rotation where there is a ``reference``."""
+    n_positions = d - (0 if reference is None else 3)
+    return Outputs(n_positions, None if units is None else units[:n_positions], reference, axes)
 
 
 def common_axes(deviation: Floats, degrees: NDArray[np.integer], least: float) -> Floats:

@@ -164,9 +164,7 @@ def turned_rows(schedule: Any, rotation: ArrayLike, translation: ArrayLike | Non
             must = "the same for all axes that turn into each other"
             remedy = "give schedules limits for each block, or none"
             raise checks.refusal(schedule.stiffness_limits, "stiffness_limits", must, remedy)
-    whole = np.zeros((schedule.n_outputs, schedule.n_outputs))
-    for block in schedule.blocks:
-        whole[block, block] = turn
+    whole = np.kron(np.eye(len(schedule.blocks)), turn)
     moved = 0.0 if translation is None else checks.array(translation, "translation", (p,))
     rows = {"position": schedule.position @ turn.T + moved, "velocity": schedule.velocity @ whole.T}
     if schedule.acceleration is not None:
