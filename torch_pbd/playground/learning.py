@@ -4,7 +4,7 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -186,19 +186,15 @@ schedule.save("schedule.npz")
 
 
 def _yaml(learned: Learned) -> str:
-    settings, name = learned.settings, next(iter(learned.controllers))
-
-    def spec(class_path: str, **init_args: Any) -> dict[str, Any]:
-        return {"class_path": class_path, "init_args": init_args}
-
-    limits = {key: getattr(settings, key) for key in ("stiffness_min", "stiffness_max", "smooth")}
-    controller = spec(
-        "DMPController",
-        covariance=spec(name) if name in MOVEMENTS else spec("TrajectoryRegressor", regressor=spec(name)),
-        n_steps=_STEPS,
-        stiffness_law=spec("StiffnessLaw", **limits),
-        mass=settings.mass,
-        damping_ratio=settings.damping_ratio,
-    )
-    content = {"data": "demonstrations.csv", "controllers": {"mine": controller}}
+    mine = _spec(_controller(_model(next(iter(learned.controllers))), learned.settings))
+    content = {"data": "demonstrations.csv", "controllers": {"mine": mine}}
     return "# torch-pbd experiment --config skill.yaml\n" + str(yaml.safe_dump(content, sort_keys=False))
+
+
+def _spec(value: Any) -> Any:
+    """Value as the command line's files have it: of an object the class, and what is not as by default."""
+    if not is_dataclass(value):
+        return value
+    parameters = {own.name: (getattr(value, own.name), own.default) for own in fields(value)}
+    changed = {name: _spec(given) for name, (given, default) in parameters.items() if given != default}
+    return {"class_path": type(value).__name__, "init_args": changed}
