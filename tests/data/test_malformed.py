@@ -152,3 +152,12 @@ def test_huge_declared_sizes_take_no_memory(tmp_path):
     pq.write_table(wide, tmp_path / "c.parquet")
     with pytest.raises(DataFormatError, match=r"times\[0\] has 1 samples"):
         load_demonstrations(tmp_path / "c.parquet")
+
+
+@pytest.mark.parametrize(
+    "rows", [[[1.0, 2.0], [3.0], [4.0, 5.0, 6.0]], [[1.0], None, [2.0]], [[1.0]] * 2**14 + [[1.0, 2.0]]]
+)
+def test_lists_of_parquet_that_differ_in_length_are_no_matrix(rows, tmp_path):
+    pq.write_table(pa.table({"time": np.arange(len(rows)), "state": rows}), tmp_path / "lists.parquet")
+    with pytest.raises(DataFormatError, match="differ in length"):
+        load_demonstrations(tmp_path / "lists.parquet")

@@ -13,8 +13,8 @@ from torch_pbd.data.recordings import preview
 from torch_pbd.data.wanted import Arguments, Wanted, column_names, natural, numeric
 from torch_pbd.registry import optional
 
-# Piece by piece: what is packed and unpacked at a time would be several times the numbers. With four times as many rows
-# what the library keeps is half of the numbers more; without a buffer, in bytes, it holds all of a row group.
+# Rows at a time: what is packed and unpacked of a whole column of lists would be several times its numbers. Without a
+# buffer, in bytes, the library holds all of a row group.
 _ROWS, _BUFFER = 2**14, 2**20
 _LARGEST_INFO = 2**22  # letters of meta/info.json
 # Zarr's codecs of numbers; another one, pickle, would execute what is in the file.
@@ -39,32 +39,22 @@ def _read_columns(file: Any, names: Sequence[str], wanted: Wanted) -> dict[str, 
     metadata = file.metadata
     packed = sum(metadata.row_group(i).total_byte_size for i in range(metadata.num_row_groups))
     wanted.require(max(packed, 8.0 * metadata.num_rows * len(names)), "it")
-    columns: dict[str, NDArray[Any]] = {}
-    n = 0
-    for batch in file.iter_batches(_ROWS, columns=list(names), use_threads=False):
-        for name in names:
-            values = _as_array(batch.column(name))
-            if name not in columns:
-                columns[name] = np.empty((metadata.num_rows, *values.shape[1:]), values.dtype)
-            column = columns[name]
-            if column.shape[1:] != values.shape[1:]:
-                raise ValueError(f"column {name!r} has lists that differ in length.")
-            # Whole numbers become floats where some are absent.
-            columns[name] = column.astype(np.result_type(column, values), copy=False)
-            columns[name][n : n + len(values)] = values
-        n += batch.num_rows
-    if n != metadata.num_rows:
-        raise ValueError(f"it says that it has {metadata.num_rows} rows, and has {n}.")
-    return {name: columns.get(name, np.empty(0)) for name in names}
+    columns = {}
+    for name in names:
+        batches = file.iter_batches(_ROWS, columns=[name], use_threads=False)
+        parts = [_as_array(batch.column(name)) for batch in batches] or [np.empty(0)]
+        if len({part.shape[1:] for part in parts}) > 1:
+            raise ValueError(f"column {name!r} has lists that differ in length.")
+        columns[name] = np.concatenate(parts)  # whole numbers become floats where some are absent
+    return columns
 
 
 def _as_array(column: Any) -> NDArray[Any]:
-    if hasattr(column.type, "value_type") and not hasattr(column.type, "index_type"):
-        values = column.flatten().to_numpy(zero_copy_only=False)
-        if column.null_count or len(values) % len(column):
-            raise ValueError(f"it has lists of {column.type}, which are absent in some rows or differ in length.")
-        return values.reshape(len(column), -1)
-    return column.to_numpy(zero_copy_only=False)
+    if not hasattr(column.type, "value_type") or hasattr(column.type, "index_type"):
+        return column.to_numpy(zero_copy_only=False)
+    if column.null_count or len(column.value_lengths().unique()) > 1:
+        raise ValueError(f"it has lists of {column.type}, which are absent in some rows or differ in length.")
+    return column.flatten().to_numpy(zero_copy_only=False).reshape(len(column), -1)
 
 
 def read_lerobot(path: Path, wanted: Wanted) -> Arguments:
