@@ -7,7 +7,7 @@ import pytest
 from safetensors.numpy import save as to_bytes
 
 from torch_pbd.exceptions import ModelFileError
-from torch_pbd.persistence import MAX_HEADER_BYTES, _digest, read_archive, write_archive
+from torch_pbd.persistence import MAX_HEADER_BYTES, checksum, read_archive, write_archive
 
 ARRAYS = {
     "weight": np.arange(12.0).reshape(3, 4),
@@ -33,7 +33,7 @@ def forged(path, text, arrays=ARRAYS, key="torch_pbd"):
 
 
 def signed(header, arrays=ARRAYS):
-    return json.dumps({**header, "sha256": _digest(header, arrays)})
+    return json.dumps({**header, "sha256": checksum(header, arrays)})
 
 
 def test_header_and_arrays_come_back(path):

@@ -14,7 +14,7 @@ from safetensors.numpy import save as to_bytes
 
 import torch_pbd
 from torch_pbd.exceptions import ModelFileError
-from torch_pbd.persistence import _digest, read_archive
+from torch_pbd.persistence import checksum, read_archive
 
 LAW = {"stiffness_law": {"stiffness_min": 50.0, "stiffness_max": 1000.0, "sigma_low": 0.1, "sigma_high": 0.2,
                          "bounds": "sigma", "smooth": False}}  # fmt: skip
@@ -27,7 +27,7 @@ def parts(name):
 
 def forge(tmp_path, header, arrays):
     path = tmp_path / "forged.safetensors"
-    text = json.dumps({**header, "sha256": _digest(header, arrays)})
+    text = json.dumps({**header, "sha256": checksum(header, arrays)})
     path.write_bytes(to_bytes(dict(arrays), metadata={"torch_pbd": text}))
     return path
 

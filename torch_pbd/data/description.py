@@ -76,7 +76,7 @@ def describe(demonstrations: Any, notes: Mapping[str, str]) -> Description:
         rotation = f"Rotations are {', '.join(names[-3:])} around the quaternion w x y z of {shown}; the furthest is "
         rotation += f"{np.degrees(furthest):.0f} degrees from it."
     mistakes = [*notes, *_of_times(demonstrations, second), *_of_ends(demonstrations, recordings)]
-    mistakes += [*demonstrations.suspects, *_flips(demonstrations), *_of_outputs(demonstrations.units, outputs, notes)]
+    mistakes += [*demonstrations.suspects, *_of_outputs(demonstrations, outputs, notes)]
     return Description(recordings, outputs, tuple(mistakes), rotation)
 
 
@@ -125,9 +125,15 @@ def _of_ends(demonstrations: Any, recordings: list[dict[str, Any]]) -> Iterator[
             yield f"{moving}: record from rest to rest, or give settle= to schedule()."
 
 
-def _of_outputs(units: Any, outputs: list[dict[str, Any]], notes: Mapping[str, str]) -> Iterator[str]:
+def _of_outputs(demonstrations: Any, outputs: list[dict[str, Any]], notes: Mapping[str, str]) -> Iterator[str]:
+    for place in quaternions(demonstrations.positions, demonstrations.n_outputs):
+        name = f"Quaternion {', '.join(demonstrations.names[place : place + 4])}"
+        each = [position[:, place : place + 4] for position in demonstrations.positions]
+        flips = [k for k, q in enumerate(each) if ((q[1:] * q[:-1]).sum(axis=1) < 0.0).any() or q[0] @ each[0][0] < 0.0]
+        if flips:
+            yield f"{name} is -q where it was q, in recordings {preview(flips)}: rotation= takes either sign."
     covers = {row["output"]: row["extent"] for row in outputs}
-    if units is None and "units" not in notes.values():
+    if demonstrations.units is None and "units" not in notes.values():
         largest, name = max((extent, name) for name, extent in covers.items())
         far = f" Output {name} covers {largest:.4g}: as metres that is far." if largest > _FURTHEST else ""
         yield f"The outputs have no units: give units=, as 'm', 'mm', 'rad', or one for each.{far}"
@@ -138,16 +144,6 @@ def _of_outputs(units: Any, outputs: list[dict[str, Any]], notes: Mapping[str, s
     constant = [name for name, extent in covers.items() if extent == 0.0]
     if constant:
         yield f"{', '.join(constant)} never changes: leave it out, outputs={[n for n in covers if n not in constant]}."
-
-
-def _flips(demonstrations: Any) -> Iterator[str]:
-    """Mistakes in the signs of unit quaternions."""
-    for place in quaternions(demonstrations.positions, demonstrations.n_outputs):
-        name = f"Quaternion {', '.join(demonstrations.names[place : place + 4])}"
-        each = [position[:, place : place + 4] for position in demonstrations.positions]
-        flips = [k for k, q in enumerate(each) if ((q[1:] * q[:-1]).sum(axis=1) < 0.0).any() or q[0] @ each[0][0] < 0.0]
-        if flips:
-            yield f"{name} is -q where it was q, in recordings {preview(flips)}: rotation= takes either sign."
 
 
 def check_unimodal(demonstrations: Any) -> bool:

@@ -128,9 +128,9 @@ def _check_reach(times: Sequence[Floats], turns: Sequence[Floats]) -> None:
     k = int(np.argmax([angle.max() for angle in angles]))
     i = int(np.argmax(angles[k]))
     furthest = angles[k][i]
-    what = f"ecording {k} is {furthest:.1f} degrees from the mean rotation at {times[k][i]:.6g}"
+    what = f"recording {k} is {furthest:.1f} degrees from the mean rotation at {times[k][i]:.6g}"
     remedy = "leave a wrong sample out, or, as of screws, learn deviations from the mean rotation of each time"
     if furthest > FURTHEST:
-        raise InvalidParameterError(f"r{what}, must be at most {FURTHEST:.0f}: {remedy}.")
+        raise InvalidParameterError(f"{what}, must be at most {FURTHEST:.0f}: {remedy}.")
     if furthest > _FAR:
-        checks.warn(f"R{what}, and {FURTHEST:.0f} are refused: {remedy}.")
+        checks.warn(f"{what.capitalize()}, and {FURTHEST:.0f} are refused: {remedy}.")

@@ -23,6 +23,7 @@ _QUANTUM, _NOISE, _TREMOR = 5e-6, 2e-6, 1e-4
 # Scales of the unit-variance wandering and correcting of a lane, and the share of the half-width that it stays within.
 _WANDER, _CORRECTION, _WITHIN = 0.12, 0.04, 0.85
 _BLENDED = 0.15  # share of the path next to a common end in which lanes blend
+_N_WAVES = 32  # cosines whose sum is nearly normal
 
 
 def paper_mean(xi: ArrayLike) -> Floats:
@@ -176,15 +177,15 @@ def check_recording(n_demos: int, duration: float, rate: float, timing: float = 
     require_much(400.0 * n_demos * duration * rate, what=f"n_demos={n_demos}", remedy="Make fewer samples.")
 
 
-def band_noise(time: Floats, low: float, high: float, random: Random, n_waves: int = 32) -> Floats:
+def band_noise(time: Floats, low: float, high: float, random: Random) -> Floats:
     """Stationary noise of unit variance with frequencies between ``low`` and ``high``, in Hz.
 
     A sum of cosines with random frequencies and phases, which is exact at any times, evenly spaced or not
     (spectral representation: M. Shinozuka, G. Deodatis, Applied Mechanics Reviews 44, 1991).
     """
-    frequency = random.uniform(low, high, size=n_waves)
-    shift = random.uniform(0.0, 2.0 * np.pi, size=n_waves)
-    return np.sqrt(2.0 / n_waves) * np.cos(2.0 * np.pi * np.outer(time, frequency) + shift).sum(axis=1)
+    frequency = random.uniform(low, high, size=_N_WAVES)
+    shift = random.uniform(0.0, 2.0 * np.pi, size=_N_WAVES)
+    return np.sqrt(2.0 / _N_WAVES) * np.cos(2.0 * np.pi * np.outer(time, frequency) + shift).sum(axis=1)
 
 
 def generator(random_state: Seed) -> Random:

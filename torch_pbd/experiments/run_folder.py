@@ -5,7 +5,6 @@ Importing this module does not load torch: a folder that cannot be written is re
 
 import base64
 import csv
-import hashlib
 import html
 import io
 import json
@@ -108,19 +107,15 @@ def _key(model: Any, *data: Any) -> str:
     """SHA-256 of class, parameters, versions and data."""
     import torch
 
+    from torch_pbd.persistence import checksum
     from torch_pbd.persistence.plain import encode_parameters
 
-    # What rows of demonstrations do not say, names and units, counts too: a controller keeps them.
-    labels: list[Any] = []
+    described = encode_parameters(model) | {"versions": [torch_pbd.__version__, torch.__version__]}
     if len(data) == 1:
+        # What rows of demonstrations do not say, names and units, counts too: a controller keeps them.
         (demos,) = data
-        labels, data = [demos.names, demos.units, demos.frame, demos.time_unit], demos.stack()
-    described = [encode_parameters(model), torch_pbd.__version__, torch.__version__, labels]
-    digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
-    for array in map(np.asarray, data):
-        digest.update(f"{array.dtype} {array.shape}".encode())
-        digest.update(array.tobytes())
-    return digest.hexdigest()
+        described["labels"], data = [demos.names, demos.units, demos.frame, demos.time_unit], demos.stack()
+    return checksum(described, {name: np.asarray(array) for name, array in zip("Xyg", data, strict=True)})
 
 
 class RunFolder:

@@ -216,7 +216,7 @@ def write_archive(path: Path, header: Mapping[str, Any], arrays: Arrays) -> None
     whole = {name: np.asarray(array, order="C") for name, array in arrays.items()}
     # Through JSON once: the checksum is of what will be read again, lists where there were tuples.
     plain = json.loads(json.dumps(dict(header)))
-    text = json.dumps({**plain, "sha256": _digest(plain, whole)})
+    text = json.dumps({**plain, "sha256": checksum(plain, whole)})
     if len(text) > MAX_HEADER_BYTES:
         raise ValueError(
             f"the header of {path} has {len(text)} bytes, must have at most {MAX_HEADER_BYTES}: keep long lists as "
@@ -253,7 +253,7 @@ def read_archive(path: Path) -> tuple[dict[str, Any], Arrays]:
         raise ModelFileError(
             f"{path} has format version {found!s:.40}; this torch_pbd reads {FORMAT_VERSION}. Upgrade it."
         )
-    if header.pop("sha256", None) != _digest(header, arrays):
+    if header.pop("sha256", None) != checksum(header, arrays):
         raise ModelFileError(f"{path} is damaged: it does not match its checksum.")
     return header, arrays
 
@@ -273,7 +273,8 @@ def _unpacked(content: bytes) -> tuple[str, Arrays]:
     return metadata[_KEY], arrays
 
 
-def _digest(header: dict[str, Any], arrays: Arrays) -> str:
+def checksum(header: dict[str, Any], arrays: Arrays) -> str:
+    """SHA-256 of what JSON holds and of arrays by their names."""
     digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     for name in sorted(arrays):
         digest.update(f"{name} {arrays[name].dtype} {arrays[name].shape} ".encode())
