@@ -88,16 +88,17 @@ def evenly(n: int, most: int) -> Int64[Tensor, " m"]:
     return torch.linspace(0, n - 1, min(n, most)).round().long().unique()
 
 
-def scale_tril_from_root(root: Float[Tensor, "*b d r"]) -> Float[Tensor, "*b d d"]:
+def scale_tril_from_root(root: Float[Tensor, "*b d r"], least: float | Tensor = 0.0) -> Float[Tensor, "*b d d"]:
     """Lower Cholesky factor of ``root @ root.mT``, its diagonal not negative.
 
     A QR decomposition of the transpose never forms the product: small variances keep all their digits beside large
     ones, and a root of rank below d (fewer demonstrations than outputs, a constant output) gives zeros on the diagonal
-    instead of a failure.
+    instead of a failure. ``least`` is a deviation besides, of one number or of numbers (d,), that each output has.
     """
     n_outputs, rank = root.shape[-2:]
-    if rank < n_outputs:
-        root = torch.cat([root, root.new_zeros(*root.shape[:-1], n_outputs - rank)], dim=-1)
+    if rank < n_outputs or isinstance(least, Tensor) or least > 0.0:
+        own = least * torch.eye(n_outputs).to(root)
+        root = torch.cat([root, own.expand(*root.shape[:-1], n_outputs)], dim=-1)
     # The decomposition leaves the signs of the rows of R open.
     upper = torch.linalg.qr(root.mT).R
     sign = torch.where(upper.diagonal(dim1=-2, dim2=-1) < 0, -1.0, 1.0).to(upper)

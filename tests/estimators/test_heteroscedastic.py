@@ -337,7 +337,7 @@ def test_draws_of_the_covariance_average_to_its_expectation():
     sampled = model.sample_cov(X, 400, random_state=0)
     core, scale = model.module_.core, model.module_.y_scale.numpy()
     x = (torch.tensor(X) - model.module_.x_shift) / model.module_.x_scale
-    root = (core.pooled_tril @ core.covariance_process.at(x).expected_root(1e12)).numpy() * scale[:, np.newaxis]
+    root = (core.pooled_tril @ core.processes.covariance.at(x).expected_root(1e12)).numpy() * scale[:, np.newaxis]
     error = sampled.std(-1) / 400**0.5
     assert (np.abs(sampled.mean(-1) - root @ root.transpose(0, 2, 1)) < 5.0 * error).all()
     diagonal = np.diagonal(model.predict_cov(X, missing_knowledge=False), axis1=1, axis2=2)
@@ -489,7 +489,7 @@ def test_a_step_without_variance_does_not_distort_its_neighbours(grouped):
 
 def test_a_length_scale_that_is_given_is_held():
     model = new("heteroscedastic", length_scale=0.7).fit(*demonstrations())
-    process = model.module_.core.covariance_process
+    process = model.module_.core.processes.covariance
     for processes in (process.log_variances, process.rows):
         expected = torch.full_like(processes.length_scale, 0.7 / 2.0)  # in ranges of X
         torch.testing.assert_close(processes.length_scale, expected, rtol=1e-12, atol=0)

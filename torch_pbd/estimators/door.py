@@ -203,13 +203,9 @@ class TorchEstimator(BaseEstimator, ABC):
         scaling = Standardization.fit(X, y)
         standardized = scaling.inputs(X)
         inputs, index = distinct_rows(standardized)
-        self._check_memory(len(inputs), X.shape[1], y.shape[1])
         outputs = self._door(scaling.outputs(y))
         rows = TrainingSet(self._door(standardized), outputs, self._door(inputs), self._door(index).long())
         return scaling, rows
-
-    def _check_memory(self, n_distinct: int, n_features: int, n_outputs: int) -> None:
-        """Check that a fit of so many distinct inputs has the memory that it needs."""
 
     def _prior_tril(self, training: TrainingSet, scaling: Standardization) -> Tensor:
         """Standardized factor of the prior: (d, d), or (n, d, d) at the training inputs where it is callable."""

@@ -174,6 +174,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         else:
             check_demonstrations(X, y, groups)
         scaling, training = self._training_set(X, y)
+        check_memory(self.n_inducing, self.max_inputs, (len(training.inputs), X.shape[1], y.shape[1]))
         length_scale = length_scale_in_ranges(self.length_scale, scaling.x_scale)
         period = period_in_ranges(self.period, self.kernel, scaling.x_scale)
         held, circle = (None if value is None else self._door(value) for value in (length_scale, period))
@@ -191,7 +192,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         fit = fit_heteroscedastic(training, group, to_try, options, rows=rows if self.n_inducing is None else None)
         # A callable prior is asked again at every prediction.
         model = HeteroscedasticModel(fit, prior_tril if prior_tril.ndim == 2 else prior_tril[0])
-        least = model.covariance_process.log_variances.family.shortest_length_scale
+        least = model.processes.covariance.log_variances.family.shortest_length_scale
         if held is not None and bool((held < least).any()):
             checks.warn(
                 f"length_scale is below {least:.3g} of the range of X, which is what the inputs (or n_inducing of "
@@ -201,9 +202,6 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         self.effective_share_ = 1.0 if fit.correlation is None else float(fit.correlation.share.mean())
         report = options.outcome(tuple(-value for value in fit.log_evidence))
         return model, scaling, report, ProcessFamily.jitter
-
-    def _check_memory(self, n_distinct: int, n_features: int, n_outputs: int) -> None:
-        check_memory(self.n_inducing, self.max_inputs, (n_distinct, n_features, n_outputs))
 
 
 def _warn_of_residuals(fit: HeteroscedasticFit, given: torch.Tensor) -> None:

@@ -129,6 +129,13 @@ class LatentCovarianceRegressor(CovarianceRegressor):
 
     def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, order: Integers) -> Fit:
         scaling, training = self._training_set(X, y)
+        n_inputs, n_processes = min(len(training.inputs), self.max_inputs), self._n_processes(y.shape[1])
+        require_much(
+            8.0 * n_inputs**2 * n_processes * 4,
+            what=f"max_inputs={self.max_inputs} lets {n_inputs} distinct inputs into kernel matrices of "
+            f"{n_processes} processes, which",
+            remedy=f"Lower {self._costly}.",
+        )
         counts = training.counts.cpu().numpy()
         aligned = self._works_on_empirical(scaling.in_units(training.inputs.cpu().numpy()), counts, y.shape[1])
         length_scale = length_scale_in_ranges(self.length_scale, scaling.x_scale)
@@ -251,15 +258,6 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         likelihood = Likelihood(link, training.scatter_root(residual), training.counts, 1.0 / len(residual))
         report = train(likelihood, latent, self.solver, self.max_iter, self.tol, self._progress())
         return link.root(latent()), latent, report
-
-    def _check_memory(self, n_distinct: int, n_features: int, n_outputs: int) -> None:
-        n_inputs, n_processes = min(n_distinct, self.max_inputs), self._n_processes(n_outputs)
-        require_much(
-            8.0 * n_inputs**2 * n_processes * 4,
-            what=f"max_inputs={self.max_inputs} lets {n_inputs} distinct inputs into kernel matrices of "
-            f"{n_processes} processes, which",
-            remedy=f"Lower {self._costly}.",
-        )
 
     def _n_processes(self, n_outputs: int) -> int:
         return (n_outputs + 1) ** 2

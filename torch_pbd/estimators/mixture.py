@@ -81,7 +81,10 @@ class GMMBaseline(CovarianceRegressor):
         checks.number(self.reg_covar, "reg_covar", above=0.0)
 
     def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, order: Integers) -> Fit:
-        points = _points(X, y)
+        # Rows [x, y] with unit variance, told apart where k-means can.
+        joint = np.hstack([X, y])
+        above = joint - joint[0]
+        points = np.round((above - above.mean(axis=0)) / spread_of(joint), _DECIMALS)
         n_distinct, n_components = len(distinct_rows(points)[0]), int(self.n_components)
         if n_distinct < self.n_components:
             raise ValueError(
@@ -113,13 +116,6 @@ class GMMBaseline(CovarianceRegressor):
         if self.solver == "lbfgs":
             report = refine(mixture, data, callback=self._progress(), **limits)
         return mixture, scaling, report, float(self.reg_covar)
-
-
-def _points(X: Floats, y: Floats) -> Floats:
-    """Rows [x, y] with unit variance, told apart where k-means can."""
-    joint = np.hstack([X, y])
-    above = joint - joint[0]
-    return np.asarray(np.round((above - above.mean(axis=0)) / spread_of(joint), _DECIMALS))
 
 
 def _by_residual(X: Floats, y: Floats) -> Standardization:

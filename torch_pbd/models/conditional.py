@@ -149,10 +149,9 @@ class ConditionalNormal(nn.Module):
     def __init__(self, core: Core, x_shift: Tensor, x_scale: Tensor, y_shift: Tensor, y_scale: Tensor) -> None:
         super().__init__()
         self.core = core
-        self.register_buffer("x_shift", x_shift)
-        self.register_buffer("x_scale", x_scale)
-        self.register_buffer("y_shift", y_shift)
-        self.register_buffer("y_scale", y_scale)
+        units = {"x_shift": x_shift, "x_scale": x_scale, "y_shift": y_shift, "y_scale": y_scale}
+        for name, unit in units.items():
+            self.register_buffer(name, unit)
 
     @classmethod
     def restored(cls, core_class: type[Core], config: Any, state: Mapping[str, Tensor]) -> "ConditionalNormal":

@@ -90,9 +90,7 @@ class Link(ABC):
 
     def root(self, deviation: Float[Tensor, "n b"]) -> Float[Tensor, "n d r"]:
         """Root at each input."""
-        return self._root(self.unflatten(deviation))
-
-    def _root(self, beside: Tensor) -> Tensor:
+        beside = self.unflatten(deviation)
         beside = beside if self.scale_matrix_tril is None else self.scale_matrix_tril.tril() @ beside
         root = self._linked(self.prior) + beside
         if self.log_diagonal:
@@ -110,8 +108,7 @@ class Link(ABC):
         It is the prior times one less an interpolation of ones, which swings to 1.14 between two inputs: of a prior far
         above the values, as of a movement of many standard deviations, it would take more away than there is.
         """
-        beside, alone = self.unflatten(both)
-        root = self._root(beside)
+        root, alone = self.root(both[0]), self.unflatten(both[1])
         bounded = alone + (root - alone).clamp(self.prior.clamp_max(0.0), self.prior.clamp_min(0.0))
         if self.log_diagonal:  # the prior is a factor of an entry whose logarithm deviates, and takes nothing away
             bounded.diagonal(dim1=-2, dim2=-1).copy_(root.diagonal(dim1=-2, dim2=-1))

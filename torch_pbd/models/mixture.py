@@ -153,7 +153,10 @@ def expectation_maximization(
     """
     padded = nn.functional.pad(data, (0, 1), value=1.0)  # by ones: moments of order 0 to 2 in one product
     blocks = [block.mT.contiguous() for block in padded.split(_BLOCK)]
-    components = best = _first_m_step(data, responsibilities, reg_covar)
+    count = responsibilities.sum(0) + 10 * torch.finfo(data.dtype).eps
+    mean = responsibilities.mT @ data / count.unsqueeze(-1)
+    root = (responsibilities / count).mT.sqrt().unsqueeze(1) * (data.mT - mean.unsqueeze(-1))
+    components = best = Components((count / count.sum()).log(), mean, _regular(root, reg_covar))
     loss, moments = _e_step(components, blocks)
     curve, n_iter, converged = [loss], 0, False
     while n_iter < max_iter and not converged:
@@ -187,7 +190,10 @@ def refine(
     """
     with torch.no_grad():
         start = mixture.components()
-        spread = _spread_above(start.scale_tril, reg_covar).requires_grad_()
+        # From C B B' C' = C C' - reg_covar I, which the floor is added to, follows B B' = I - reg_covar C^-1 C^-T.
+        inverse = triangular_inverse(start.scale_tril)
+        excess, axes = torch.linalg.eigh(torch.eye(data.shape[1]).to(data) - reg_covar * inverse @ inverse.mT)
+        spread = (axes * excess.clamp_min(0).sqrt().unsqueeze(-2)).requires_grad_()
         shift = torch.zeros_like(start.mean).requires_grad_()
         log_weight = start.log_weight.clone().requires_grad_()
 
@@ -214,30 +220,13 @@ def _with_density_floor(components: Components, inputs: Float[Tensor, "n e"]) ->
     return mixture
 
 
-def _spread_above(scale_tril: Float[Tensor, "k p p"], reg_covar: float) -> Float[Tensor, "k p p"]:
-    """Factor B with which scale_tril B B^T scale_tril^T + reg_covar I are the covariances."""
-    # From C B B' C' = C C' - reg_covar I follows B B' = I - reg_covar C^-1 C^-T.
-    inverse = triangular_inverse(scale_tril)
-    excess, axes = torch.linalg.eigh(torch.eye(len(inverse[0])).to(inverse) - reg_covar * inverse @ inverse.mT)
-    return axes * excess.clamp_min(0).sqrt().unsqueeze(-2)
-
-
 def _regular(root: Float[Tensor, "k p r"], reg_covar: float) -> Float[Tensor, "k p p"]:
     """Lower Cholesky factors of ``root @ root.mT + reg_covar * I``."""
-    floor = (math.sqrt(reg_covar) * torch.eye(root.shape[-2]).to(root)).expand(len(root), -1, -1)
-    scale_tril = scale_tril_from_root(torch.cat([root, floor], dim=-1))
+    scale_tril = scale_tril_from_root(root, math.sqrt(reg_covar))
     rounding = root.shape[-2] * torch.finfo(root.dtype).eps * scale_tril.detach().norm(dim=-1)
     if (scale_tril.diagonal(dim1=-2, dim2=-1) <= rounding).any():
         raise NotPositiveDefiniteError("A component has collapsed: raise reg_covar, or take fewer.")
     return scale_tril
-
-
-def _first_m_step(data: Float[Tensor, "n p"], share: Float[Tensor, "n k"], reg_covar: float) -> Components:
-    """Most likely components of given responsibilities."""
-    count = share.sum(0) + 10 * torch.finfo(data.dtype).eps
-    mean = share.mT @ data / count.unsqueeze(-1)
-    root = (share / count).mT.sqrt().unsqueeze(1) * (data.mT - mean.unsqueeze(-1))
-    return Components((count / count.sum()).log(), mean, _regular(root, reg_covar))
 
 
 def _e_step(components: Components, blocks: list[Tensor]) -> tuple[float, Float[Tensor, "k q q"]]:

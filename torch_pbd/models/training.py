@@ -112,18 +112,13 @@ def pooled_tril(training: TrainingSet) -> Float[Tensor, "d d"]:
 
 def residual_tril(residual: Tensor) -> Tensor:
     """Factor of the covariance of all residuals, where the training of a likelihood starts."""
-    floor = 1e-6 * torch.eye(residual.shape[1]).to(residual)
-    return scale_tril_from_root(torch.cat([residual.mT / len(residual) ** 0.5, floor], dim=1))
+    return scale_tril_from_root(residual.mT / len(residual) ** 0.5, 1e-6)
 
 
 def default_prior_tril(y: Tensor) -> Tensor:
-    """Factor of a wide prior: four times the covariance of all of y around its mean.
-
-    A thousandth of the unit matrix is mixed in: outputs that move together, or do not move at all, have
-    some freedom of their own where nothing is known.
-    """
-    centred = (0.999 / (len(y) - 1)) ** 0.5 * (y - y.mean(0)).mT
-    return 2.0 * scale_tril_from_root(torch.cat([centred, 0.001**0.5 * torch.eye(y.shape[1]).to(y)], dim=1))
+    """Factor of a wide prior: four times the covariance of all of y around its mean."""
+    # With a thousandth of the unit matrix outputs that move together, or not at all, have some freedom of their own.
+    return 2.0 * scale_tril_from_root((0.999 / (len(y) - 1)) ** 0.5 * (y - y.mean(0)).mT, 0.001**0.5)
 
 
 def empirical_tril(training: TrainingSet, *, bias_correction: bool = False) -> Float[Tensor, "n d d"]:

@@ -96,9 +96,9 @@ def test_on_data_the_covariance_is_the_sum_of_its_parts(model):
     """The expected covariance of the variability and the error of the mean, with no share of the prior."""
     x = model.inducing
     _, root = model(x)
-    moments = model.covariance_process.at(x)
+    moments = model.processes.covariance.at(x)
     variability = model.pooled_tril @ moments.expected_root(2.0)
-    error = model.mean_process.at(x)[1]
+    error = model.processes.mean.at(x)[1]
     expected = variability @ variability.mT + error
     torch.testing.assert_close(root @ root.mT, expected, rtol=1e-7, atol=1e-9)
     alone = model.pooled_tril @ moments.tril()
@@ -112,17 +112,17 @@ def test_degrees_are_those_of_a_variance_whose_logarithm_is_as_uncertain(low, hi
     model = fitted(1)
     x = model.inducing
     root = model.log_variance_root.clone()
-    start = float(model.covariance_process.at(x).log_variance_variance[0])
+    start = float(model.processes.covariance.at(x).log_variance_variance[0])
     for variance in np.geomspace(low, high, 10):
         model.log_variance_root = root * (variance / start) ** 0.5
-        known = float(model.covariance_process.at(x).log_variance_variance[0])
+        known = float(model.processes.covariance.at(x).log_variance_variance[0])
         assert known == pytest.approx(variance, rel=1e-2)
         expected = brentq(lambda degrees, known=known: polygamma(1, degrees / 2.0) - known, 1e-3, 1e6)
         assert float(model.degrees(x)[0]) == pytest.approx(max(3.0, expected), rel=rtol)
 
 
 def test_degrees_are_of_the_mean_over_the_outputs_and_unlimited_far_away(model):
-    variance = model.covariance_process.at(model.inducing).log_variance_variance.mean(1)
+    variance = model.processes.covariance.at(model.inducing).log_variance_variance.mean(1)
     expected = (1.0 + (1.0 + 2.0 * variance).sqrt()) / variance
     torch.testing.assert_close(model.degrees(model.inducing), expected, rtol=1e-9, atol=0)
     assert float(model.degrees(torch.tensor([[1e6]]).double())) > 1e10

@@ -228,7 +228,8 @@ def fit_heteroscedastic(
         training, share = fit.training, fit.shares()
         # C C' = sum of r r' / sum of (1 - h), once: what changes later is L's.
         if turn == 0:
-            fit.pooled_tril = _pooled_tril(fit.residual, share)
+            total = share.sum(0).sqrt()
+            fit.pooled_tril = scale_tril_from_root(fit.residual.mT, _LEAST_DEVIATION * total) / total
         # w = inv(C) r of each row; at each input their scatter S, the sum of w w', and its degrees of freedom.
         root, part = training.scatter_root(fit.normal()), first_part if turn == 0 else 1.0
         scatter, degrees = part * fit.above_rounding(root @ root.mT), part * training.sums(share).mT
@@ -255,11 +256,4 @@ def _start_tril(training: TrainingSet) -> Tensor:
     repeated = 2 * len(training.inputs) <= len(training.x)
     whole = training if repeated else training.merged(max(2, len(training.x) // _ROWS_TOGETHER))
     # A thousandth of y's deviation: noise is never less where the search for the mean begins.
-    floor = 1e-3 * torch.eye(training.y.shape[1]).to(training.y)
-    return scale_tril_from_root(torch.cat([pooled_tril(whole), floor], dim=1))
-
-
-def _pooled_tril(residual: Tensor, share: Tensor) -> Tensor:
-    """Factor of the residuals' covariance, of their degrees of freedom."""
-    floor = _LEAST_DEVIATION * share.sum(0).sqrt() * torch.eye(residual.shape[1]).to(residual)
-    return scale_tril_from_root(torch.cat([residual.mT, floor], dim=1)) / share.sum(0).sqrt()
+    return scale_tril_from_root(pooled_tril(whole), 1e-3)

@@ -92,15 +92,9 @@ def log_variance_evidence(fixed: FixedFeatures, squares: Squares, near: Float[Te
 
 
 def fit_log_variance(squares: Squares, features: Float[Tensor, "b n p"], start: Float[Tensor, "b n"]) -> LogVariance:
-    """Posterior and log evidence; ``start`` are log variances near the posterior's."""
-    if squares.noise is not None:
-        return _fit_correlated(squares, squares.noise, features)
-    return _fit_independent(squares, features, start)
+    """Posterior and log evidence; ``start`` are log variances near the posterior's.
 
-
-def _fit_independent(squares: Squares, features: Tensor, start: Tensor) -> LogVariance:
-    """Variational approximation by a normal distribution; the evidence is its lower bound.
-
+    Of independent squares it is a variational approximation by a normal distribution; the evidence is its lower bound.
     Its precision P is one plus the Fisher information, F' diag(h) F of the features F and half the degrees h, which
     for a log variance does not depend on its value. Its mean m maximizes the bound, in which
     E[1 / variance] = exp(-mean + variance of the log / 2) is exact. With the target t, the log mean square plus half
@@ -111,6 +105,8 @@ def _fit_independent(squares: Squares, features: Tensor, start: Tensor) -> LogVa
     from F m, the mean itself being at its maximum; and from t, half the diagonal of F inv(P) F',
     diag(r) A - diag(h) F Q with Q = A' diag(r) A.
     """
+    if squares.noise is not None:
+        return _fit_correlated(squares, squares.noise, features)
     half = 0.5 * squares.degrees
     # P = 1 + F' diag(h) F, and the variances of the logarithms, the diagonal of F inv(P) F'.
     factor, _ = weights_factor(half.sqrt().unsqueeze(-1) * features, torch.zeros_like(half))

@@ -34,13 +34,14 @@ _MOST_LOG_VARIANCE = 2.0
 _FAMILIES = ("mean", "log_variance", "coefficient")
 
 
-class _Prepared(NamedTuple):
+class Prepared(NamedTuple):
     """Processes of a module's buffers, with what does not depend on x computed."""
 
     buffers: tuple[Tensor, ...]
     versions: list[int]
     mean: LatentMean
     covariance: LatentCovariance
+    """Of residuals multiplied by the inverse of ``pooled_tril``."""
     nearness: Processes
     """Process of unit variance that tells how far data are."""
 
@@ -56,7 +57,7 @@ class HeteroscedasticModel(Core):
     pooled_tril: Tensor
     prior_tril: Tensor
     correlation_variance: Tensor
-    _kept: _Prepared | None = None
+    _kept: Prepared | None = None
 
     def __init__(self, fit: HeteroscedasticFit, prior_tril: Float[Tensor, "d d"]) -> None:
         super().__init__()
@@ -162,18 +163,18 @@ class HeteroscedasticModel(Core):
 
     def _known(self, x: Tensor) -> tuple[Tensor, FactorMoments, Tensor]:
         """Mean, moments of the factor, and root of the covariance of the mean's error."""
-        prepared = self._prepared()
-        mean, error = prepared.mean.at(x)
+        processes = self.processes
+        mean, error = processes.mean.at(x)
         # Where the data leave nothing to err about, rounding must not make it negative.
         least = 1e-12 * torch.diag_embed(1e-30 + error.diagonal(dim1=-2, dim2=-1))
         error_root = safe_cholesky(symmetrize(error) + least, name="the covariance of the mean's error")
-        return mean, prepared.covariance.at(x), error_root
+        return mean, processes.covariance.at(x), error_root
 
     def _root_of_demonstrations(self, factor: FactorMoments, error_root: Tensor) -> tuple[Tensor, Tensor]:
         """Root of the expected covariance of correlated samples before its correlations are shrunk, and degrees."""
         degrees = factor.degrees
         factor = replace(factor, log_variance_variance=as_inverse_gamma(factor.log_variance_variance))
-        error_root = under_expected_noise(error_root, degrees, self.mean_process.processes.amplitude.square())
+        error_root = under_expected_noise(error_root, degrees, self.processes.mean.processes.amplitude.square())
         return torch.cat([self.pooled_tril @ factor.expected_root(math.inf), error_root], dim=-1), degrees
 
     def _shrunk(self, root: Tensor, degrees: Tensor, draws: Tensor | None = None) -> Tensor:
@@ -191,11 +192,11 @@ class HeteroscedasticModel(Core):
 
     def predict_mean(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d"]:
         """Mean alone, equal to the bit."""
-        return self.mean_process.expected_at(x)
+        return self.processes.mean.expected_at(x)
 
     def variability(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d d"]:
         """Root of the covariance at the means of the latent processes, without prior and without errors."""
-        factor = self.covariance_process.at(x)
+        factor = self.processes.covariance.at(x)
         root = self._shrunk(self.pooled_tril @ factor.tril(), factor.degrees)
         return _square_root(1.0 - self.type1(x))[:, None, None] * root
 
@@ -204,13 +205,13 @@ class HeteroscedasticModel(Core):
 
         They are of a variance whose logarithm has the mean of the variances of the log variances.
         """
-        variance = self.covariance_process.log_variance_at(x)[1].mean(-1)
+        variance = self.processes.covariance.log_variance_at(x)[1].mean(-1)
         # Of the prior they are infinite: with the share of the data, 1 - missing, going to zero the law becomes normal.
         return degrees_of_freedom(variance) / (1.0 - self.type1(x)).clamp_min(1e-12)
 
     def type1(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
         """Type I uncertainty: eq. (6) without noise over the prior variance, 0 at the inducing inputs."""
-        process = self._prepared().nearness
+        process = self.processes.nearness
         return process.unexplained(process(x))[0]
 
     def draw(
@@ -220,26 +221,17 @@ class HeteroscedasticModel(Core):
         prior_tril: Float[Tensor, "n d d"] | None = None,
     ) -> Float[Tensor, "*s n d r"]:
         """Roots of posterior draws of the covariance function at x, with the prior's share in them."""
-        factor, draws = self.covariance_process.at(x), self.pooled_tril @ self.covariance_process.draw(x, normal)
+        factor, draws = self.processes.covariance.at(x), self.pooled_tril @ self.processes.covariance.draw(x, normal)
         root = self._shrunk(self.pooled_tril @ factor.tril(), factor.degrees, draws)
         return self._with_prior(root, self.type1(x), prior_tril)
 
     def draw_sizes(self) -> list[int]:
         """Sizes of the standard normal vectors that :meth:`draw` takes."""
-        rows, size = self.covariance_process.log_variance.mean.shape
-        return [size] * rows + [len(weights.mean) for weights in self.covariance_process.coefficients]
+        rows, size = self.processes.covariance.log_variance.mean.shape
+        return [size] * rows + [len(weights.mean) for weights in self.processes.covariance.coefficients]
 
     @property
-    def mean_process(self) -> LatentMean:
-        """The mean's processes."""
-        return self._prepared().mean
-
-    @property
-    def covariance_process(self) -> LatentCovariance:
-        """The covariance's processes, of residuals multiplied by the inverse of ``pooled_tril``."""
-        return self._prepared().covariance
-
-    def _prepared(self) -> _Prepared:
+    def processes(self) -> Prepared:
         """Processes of the buffers, with what does not depend on x computed; anew where a buffer is another."""
         buffers = {name: buffer for name, buffer in self._buffers.items() if buffer is not None}
         if any(buffer.is_inference() or buffer.requires_grad for buffer in buffers.values()):
@@ -251,7 +243,7 @@ class HeteroscedasticModel(Core):
                 kept = self._kept = self._prepare(buffers, versions)
         return kept
 
-    def _prepare(self, buffers: Mapping[str, Tensor], versions: list[int]) -> _Prepared:
+    def _prepare(self, buffers: Mapping[str, Tensor], versions: list[int]) -> Prepared:
         def processes(i: int, inducing: str, stretch: Tensor | None) -> Processes:
             name, period = _FAMILIES[i], buffers.get("period")
             length_scale, exact = buffers.get(f"{name}_length_scale"), self.exact[i]
@@ -268,7 +260,7 @@ class HeteroscedasticModel(Core):
         of_variances, rows = (processes(i, "inducing", buffers.get("stretch")) for i in (1, 2))
         coefficients = [weights("coefficient", f"_{i}") for i in range(1, len(rows.theta) + 1)]
         covariance = LatentCovariance(of_variances, weights("log_variance"), rows, coefficients)
-        return _Prepared(tuple(buffers.values()), versions, mean, covariance, nearness(of_variances))
+        return Prepared(tuple(buffers.values()), versions, mean, covariance, nearness(of_variances))
 
     def __getstate__(self) -> dict[str, Any]:
         """State for copies and pickle: without what is computed from the buffers."""

@@ -204,11 +204,8 @@ class FixedFeatures:
         features, but for what cannot be told: where features that carry a variance of at most v are left out, it
         changes by about half of v times the ``information``, the sum of the precisions of what is observed.
         """
-        family, length_scale, amplitude = (
-            self.family,
-            self.family.length_scale_of(theta),
-            self.family.amplitude_of(theta),
-        )
+        family = self.family
+        length_scale, amplitude = family.length_scale_of(theta), family.amplitude_of(theta)
         inverse_square = length_scale.reciprocal().square()
         gram, gram_slope = value_and_slope(self._gram, inverse_square, family.kernel)
         factor = safe_cholesky(gram + self._jitter, name="the kernel matrix of the inducing inputs")
