@@ -8,13 +8,7 @@ from torch import Tensor
 from torch_pbd import checks
 from torch_pbd.estimators.latent import LatentCovarianceRegressor, Problem, warn_if_stretched
 from torch_pbd.exceptions import DataRankWarning, NotPositiveDefiniteError
-from torch_pbd.gp.observations import (
-    LatentGP,
-    Observations,
-    condition,
-    longest_within,
-    merge_observations,
-)
+from torch_pbd.gp.observations import LatentGP, Observations, condition, longest_within, merge_observations
 from torch_pbd.gp.search import Found, fit_together
 from torch_pbd.linalg import scale_tril_from_root
 from torch_pbd.models import with_floor

@@ -69,7 +69,12 @@ class Evidence:
         correlated, slope = value_and_slope(self.square_difference, inverse_square, self.kernel)
         covariance = self.basis.covariance(correlated)
         covariance.diagonal(dim1=-2, dim2=-1).add_(noise_ratio[:, None])
-        inverse, log_det = _inverse_and_log_det(covariance)
+        factor, info = torch.linalg.cholesky_ex(covariance)
+        log_det = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        if bool(info.any()):
+            log_det = torch.where(info == 0, log_det, math.nan)
+            factor = torch.where((info > 0)[:, None, None], torch.eye(factor.shape[-1]).to(factor), factor)
+        inverse = torch.cholesky_inverse(factor)
         targets = self.targets[rows].unsqueeze(-1)
         alpha = inverse @ targets
         loss, quadratic, variance = self._density((targets * alpha).sum((-2, -1)), log_det, noise_ratio, rows)
@@ -189,13 +194,3 @@ def negative_log_evidence(
     length_scale = hyperparameters.length_scale.expand(len(noise_scale), -1)
     rows = torch.arange(len(noise_scale), device=noise_scale.device)
     return evidence(length_scale, hyperparameters.noise_ratio, rows)[0]
-
-
-def _inverse_and_log_det(matrix: Float[Tensor, "a r r"]) -> tuple[Tensor, Tensor]:
-    """Inverses and log determinants of positive definite matrices; the latter NaN for others."""
-    factor, info = torch.linalg.cholesky_ex(matrix)
-    log_det = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    if bool(info.any()):
-        log_det = torch.where(info == 0, log_det, math.nan)
-        factor = torch.where((info > 0)[:, None, None], torch.eye(factor.shape[-1]).to(factor), factor)
-    return torch.cholesky_inverse(factor), log_det

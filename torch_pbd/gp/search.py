@@ -161,15 +161,12 @@ class _Search:
                     left[rows[found[:, :n_features].amin(1) < _AT_BOUND * self.bases[-1][0]]] = True
             if not bool(left.any()):
                 return ends
-            self._keep(left)
+            # Those that have settled are left behind.
+            self._observations = replace(self._observations, targets=self._observations.targets[left])
+            self._noise = None if self._noise is None else self._noise[left]
+            self._longest, self._table = self._longest[left], self._table[left]
+            self._processes = self._processes[left]
             self._refine()
-
-    def _keep(self, chosen: Bool[Tensor, " b"]) -> None:
-        """Leave the other processes behind."""
-        self._observations = replace(self._observations, targets=self._observations.targets[chosen])
-        self._noise = None if self._noise is None else self._noise[chosen]
-        self._longest, self._table = self._longest[chosen], self._table[chosen]
-        self._processes = self._processes[chosen]
 
     def _refine(self) -> None:
         """Add the length scales that the next level carries to the grid."""

@@ -179,13 +179,18 @@ class _Output:
                 break
             unit = self._candidates([found.scales], kernel)[0]
             nugget = self._step_nuggets(unit, min(found.nugget, 0.1 * _SMOOTH))
-        found, unit = self._refined(found, nugget, kernel)
+        # The likeliest scales around those found, of all steps with the nugget of each.
+        slow, fast, weight = found.scales
+        candidates = [(factor * slow, factor * fast, weight) for factor in _BETWEEN]
+        units = self._candidates(candidates, kernel)
+        best = int(_log_likelihood(units + torch.diag(nugget), self.residual).argmax())
+        unit = units[best]
         filled = self.residual.clone()
         for own in filled:  # the kernel's expectation where there were no samples
             seen = ~own.isnan()
             root = safe_cholesky(unit[seen][:, seen] + torch.diag(nugget[seen]), name="the time kernel")
             own[~seen] = (unit[~seen][:, seen] @ torch.cholesky_solve(own[seen, None], root))[:, 0]
-        lengths, fine = self._parts([found.scales])
+        lengths, fine = self._parts([candidates[best]])
         parts = {"grid": self.grid, "scales": lengths, "fine": fine, "nugget": nugget[None]}
         return TimeKernel(kernel, **parts, residual=filled[..., None], share=nugget.new_ones(()))
 
@@ -217,14 +222,6 @@ class _Output:
         table = torch.stack([_log_likelihood((1.0 - eta) * unit + eta * eye, rows) for eta in nuggets])
         best = int(table.argmax())
         return Found(float(table.max()), candidates[best % len(candidates)], nuggets[best // len(candidates)])
-
-    def _refined(self, found: Found, nugget: Float[Tensor, " T"], kernel: str) -> tuple[Found, Float[Tensor, "T T"]]:
-        """Likeliest scales around those found, of all steps with the nugget of each, and their correlation."""
-        slow, fast, weight = found.scales
-        candidates = [(factor * slow, factor * fast, weight) for factor in _BETWEEN]
-        unit = self._candidates(candidates, kernel)
-        best = int(_log_likelihood(unit + torch.diag(nugget), self.residual).argmax())
-        return found._replace(scales=candidates[best]), unit[best]
 
     def _parts(self, scales: Sequence[Scales]) -> tuple[Float[Tensor, "b 2"], Float[Tensor, "b T"]]:
         """Length scales, and variances of the tremor over those of the slow part."""
