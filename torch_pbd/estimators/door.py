@@ -53,7 +53,7 @@ class Standardization:
         input gets its magnitude, beside which rounding is negligible in all units.
         """
         low, span = X.min(axis=0), np.ptp(X, axis=0)
-        x_scale = _or_magnitude(span, X)
+        x_scale = or_magnitude(span, X)
         y_shift, largest = y.mean(axis=0), np.abs(y).max(axis=0)
         y_scale = (y - y_shift).std(axis=0)
         varies = y_scale > CONSTANT * largest
@@ -78,12 +78,8 @@ class Standardization:
         return self.x_shift + self.x_scale * inputs
 
 
-def spread_of(columns: Floats) -> Floats:
-    """Standard deviation of each column, or the magnitude of a column that is constant up to rounding."""
-    return _or_magnitude(columns.std(axis=0), columns)
-
-
-def _or_magnitude(spread: Floats, columns: Floats) -> Floats:
+def or_magnitude(spread: Floats, columns: Floats) -> Floats:
+    """Spread of each column, or the magnitude of a column that is constant up to rounding."""
     magnitude = np.abs(columns).max(axis=0)
     return np.where(spread > CONSTANT * magnitude, spread, np.where(magnitude > 0, magnitude, 1.0))
 
@@ -146,23 +142,6 @@ def _floats(value: Any, name: str) -> Floats:
         raise ValueError(f"{name} is {value!r}, must be numbers ({error}).") from error
 
 
-def standardized_prior(prior: Prior, X: Floats, y_scale: Floats) -> Floats:
-    """Covariances of a prior, as :func:`prior_covariance`, over the outputs' deviations ``y_scale`` (d,).
-
-    It warns of variances so far from those of y, or from each other, that float64 does not hold them beside those.
-    """
-    covariance = prior_covariance(prior, X, len(y_scale)) / y_scale[:, np.newaxis] / y_scale
-    eigenvalues = np.linalg.eigvalsh(covariance)
-    lowest, highest = float(eigenvalues.min()), float(eigenvalues.max())
-    if lowest < _LOWEST * max(1.0, highest) or highest > _HIGHEST:
-        checks.warn(
-            f"prior has variances of {lowest:.3g} to {highest:.3g} times those of y. Below {_LOWEST:g} of these, or of "
-            f"the largest, they come out larger; above {_HIGHEST:g} they show where there are data. Give the prior in "
-            "squared units of y."
-        )
-    return np.asarray(covariance)
-
-
 def prior_covariance(prior: Prior, X: Floats, n_outputs: int) -> Floats:
     """Covariances (n, d, d) or (d, d) that a float, array or callable prior stands for, which are positive definite."""
     name, value = "prior", prior
@@ -211,8 +190,18 @@ class TorchEstimator(BaseEstimator, ABC):
         """Standardized factor of the prior: (d, d), or (n, d, d) at the training inputs where it is callable."""
         if self.prior is None:
             return default_prior_tril(training.y)
-        prior = standardized_prior(self.prior, scaling.in_units(training.inputs.cpu().numpy()), scaling.y_scale)
-        return safe_cholesky(self._door(prior), name="prior")
+        inputs, scale = scaling.in_units(training.inputs.cpu().numpy()), scaling.y_scale
+        covariance = prior_covariance(self.prior, inputs, len(scale)) / scale[:, np.newaxis] / scale
+        eigenvalues = np.linalg.eigvalsh(covariance)
+        lowest, highest = float(eigenvalues.min()), float(eigenvalues.max())
+        # float64 does not hold variances so far from those of y, or from each other, beside those.
+        if lowest < _LOWEST * max(1.0, highest) or highest > _HIGHEST:
+            checks.warn(
+                f"prior has variances of {lowest:.3g} to {highest:.3g} times those of y. Below {_LOWEST:g} of these, "
+                f"or of the largest, they come out larger; above {_HIGHEST:g} they show where there are data. Give the "
+                "prior in squared units of y."
+            )
+        return safe_cholesky(self._door(covariance), name="prior")
 
     def _prior_tril_at(self, x: Tensor) -> tuple[Tensor, ...]:
         """Factor of the prior at x, where it depends on x; else nothing, as the module has it."""

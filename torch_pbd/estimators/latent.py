@@ -149,7 +149,7 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         if aligned:
             core, report, jitter = self._fit_empirical(problem)
         else:
-            mean, mean_report = self._fit_mean(training, self._mean_job(training))
+            mean, mean_report = self._fit_mean(training)
             core, report, jitter = self._fit_likelihood(problem, mean)
             report = report.after(mean_report, "search of the mean")
         return core, scaling, report, jitter
@@ -204,15 +204,15 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         observations = Observations(training.inputs, training.means.mT.contiguous(), weights)
         return observations, self._search(training.inputs, _LONGEST_MEAN)
 
-    def _fit_mean(self, training: TrainingSet, job: Job, found: Found | None = None) -> tuple[LatentGP, FitReport]:
+    def _fit_mean(self, training: TrainingSet, found: Found | None = None) -> tuple[LatentGP, FitReport]:
         """Processes by evidence, or through the means where rows that repeat inputs contradict these.
 
         The evidence sees the mean at each input, not how far the rows there differ: with few inputs, or jumps between
         them, it may take for noise what all demonstrations agree on. A process that would swing far beyond the means
         between the inputs to follow them is rejected with a warning.
         """
-        observations, search = job
-        found = fit_together([job])[0] if found is None else found
+        observations, search = self._mean_job(training)
+        found = fit_together([(observations, search)])[0] if found is None else found
         mean, _ = condition(observations, found.hyperparameters, self.kernel, basis=found.basis)
         if int(training.counts.min()) < 2 or not training.repeats_inputs:
             return mean, found.report

@@ -10,7 +10,7 @@ from sklearn.neighbors import NearestNeighbors
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.estimators.base import CovarianceRegressor, Fit
-from torch_pbd.estimators.door import Integers, Standardization, distinct_rows, spread_of
+from torch_pbd.estimators.door import Integers, Standardization, distinct_rows, or_magnitude
 from torch_pbd.estimators.validation import warn_if_few
 from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.files.memory import require_much
@@ -84,7 +84,7 @@ class GMMBaseline(CovarianceRegressor):
         # Rows [x, y] with unit variance, told apart where k-means can.
         joint = np.hstack([X, y])
         above = joint - joint[0]
-        points = np.round((above - above.mean(axis=0)) / spread_of(joint), _DECIMALS)
+        points = np.round((above - above.mean(axis=0)) / or_magnitude(joint.std(axis=0), joint), _DECIMALS)
         n_distinct, n_components = len(distinct_rows(points)[0]), int(self.n_components)
         if n_distinct < self.n_components:
             raise ValueError(
@@ -125,7 +125,7 @@ def _by_residual(X: Floats, y: Floats) -> Standardization:
     and not to how far y moves.
     """
     whole = Standardization.fit(X, y)
-    x_scale = spread_of(X)
+    x_scale = or_magnitude(X.std(axis=0), X)
     # Standardized, so that neighbours at equal distances are equally far in all units.
     scaled = replace(whole, x_scale=x_scale).inputs(X)
     # Neighbour at the same or the nearest input: the row itself may come first or second among equals.

@@ -79,7 +79,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         return padded(problem.prior_tril, self.df_)
 
     def _fit_empirical(self, problem: Problem) -> tuple[MeanAndWishart, FitReport, float]:
-        mean, mean_report = self._fit_mean(problem.training, self._mean_job(problem.training))
+        mean, mean_report = self._fit_mean(problem.training)
         inputs, target = problem.training.inputs, empirical_tril(problem.training)
         link = WishartLink(self._prior_root(problem))
         root = padded(target, self.df_)

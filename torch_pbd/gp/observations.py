@@ -168,10 +168,6 @@ class Basis:
         """Gradient by the correlation of the nodes, from that by the covariance."""
         return gradient * self._weights if self.root is None else self.root.mT @ gradient @ self.root
 
-    def node_weights(self, values: Float[Tensor, "*b r q"]) -> Float[Tensor, "*b m q"]:
-        """Weights ``root' values`` of the correlations with the nodes."""
-        return self.counts.sqrt()[:, None] * values if self.root is None else self.root.mT @ values
-
 
 def levels_on_nodes(inputs: Float[Tensor, "n e"], kernel: str, max_inputs: int) -> list[tuple[float, int]]:
     """Shortest length scales that numbers of nodes carry to 1e-13 (fitted; within 10 %), the longest first."""
@@ -221,13 +217,9 @@ class LatentGP(nn.Module):
         super().__init__()
         self.kernel = kernel
         self.weight = nn.Parameter(weight)
-        self.register_buffer("inputs", inputs)
-        self.register_buffer("value_weight", value_weight)
-        self.register_buffer("length_scale", hyperparameters.length_scale)
-        self.register_buffer("amplitude", hyperparameters.amplitude)
-        self.register_buffer("noise_ratio", hyperparameters.noise_ratio)
-        self.register_buffer("counts", counts)
-        self.register_buffer("root", root)
+        buffers = {"inputs": inputs, "value_weight": value_weight, **vars(hyperparameters), "counts": counts}
+        for name, buffer in (buffers | {"root": root}).items():
+            self.register_buffer(name, buffer)
 
     def forward(self, x: Float[Tensor, "m e"]) -> Float[Tensor, "m b"]:
         """Mean at x less the prior mean: eq. (5)."""
@@ -288,7 +280,10 @@ def condition(
     gram = gram + hyperparameters.noise_ratio[:, None, None] * torch.eye(gram.shape[-1]).to(gram)
     factor, jitter = cholesky_with_jitter(gram, name="the kernel matrix of the training inputs")
     solved = torch.cholesky_solve(targets.reshape(2, -1, gram.shape[-1]).permute(1, 2, 0), factor)
-    weight, value_weight = basis.node_weights(solved).unbind(-1)
-    root = None if basis.root is None else basis.root.clone(memory_format=torch.contiguous_format)
-    weights = weight.contiguous(), value_weight.contiguous()
+    # The weights of the correlations with the nodes are root' times what is solved for.
+    if basis.root is None:
+        root, solved = None, basis.counts.sqrt()[:, None] * solved
+    else:
+        root, solved = basis.root.clone(memory_format=torch.contiguous_format), basis.root.mT @ solved
+    weights = (weight.contiguous() for weight in solved.unbind(-1))
     return LatentGP(basis.nodes.clone(), *weights, hyperparameters, basis.counts.clone(), kernel, root), jitter
