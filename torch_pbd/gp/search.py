@@ -121,7 +121,8 @@ class _Search:
         self._ratios = _noise_ratios(targets, noise) if self._noisy else targets.new_zeros(1)
         self._shortest = self._options.length_scale_bounds[0] if self._fixed is None else float(self._fixed.min())
         self._levels = self._resolutions()
-        self._scales, self._table = targets.new_zeros(0), targets.new_zeros(len(targets), 0, len(self._ratios))
+        self._scales = targets.new_zeros(0, observations.inputs.shape[1])  # length scales of the grid
+        self._table = targets.new_zeros(len(targets), 0, len(self._ratios))
         self._processes = torch.arange(len(targets), device=targets.device)  # those that are still searched
         self.bases: list[tuple[float, Basis]] = []  # shortest length scale of each level so far, and its basis
         self.n_iter, self.statuses = 0, [Status.CONVERGED]  # iterations and statuses of the descents
@@ -180,15 +181,14 @@ class _Search:
             step = _FINE_STEP if len(basis.nodes) <= _SMALL else _GRID_STEP
             n_steps = max(0, math.ceil(math.log(longest / least) / math.log(step) - 1e-9))
             new = torch.logspace(math.log10(least), math.log10(longest), n_steps + 1, dtype=self._scales.dtype)
-            new = (new[:-1] if len(self._scales) else new).to(self._scales.device)
-            each = new[:, None].expand(-1, basis.nodes.shape[1])
+            new = (new[:-1] if len(self._scales) else new)[:, None].to(self._scales).expand(-1, basis.nodes.shape[1])
         else:
-            new, each = self._fixed[:1], self._fixed[None]
-        parts = each.split(_together(basis))
+            new = self._fixed[None]
+        parts = new.split(_together(basis))
         table = torch.cat([self.evidence.table(part, self._ratios) for part in parts], dim=1)
         if self._fixed is None:
             # A process whose bound lies between two length scales of the grid keeps the nearer one above it.
-            beyond = new > _GRID_STEP**0.5 * self._longest[:, None]
+            beyond = new[:, 0] > _GRID_STEP**0.5 * self._longest[:, None]
             table = table.masked_fill(beyond.unsqueeze(-1), math.inf)
         self._scales = torch.cat([new, self._scales])
         self._table = torch.cat([table, self._table], dim=1)
@@ -203,7 +203,7 @@ class _Search:
         scale, ratio = best // len(self._ratios), best % len(self._ratios)
         if not self._levels:
             return torch.zeros_like(best, dtype=torch.bool)
-        residual = self.evidence.residual(self._scales[scale][:, None], self._ratios[ratio])
+        residual = self.evidence.residual(self._scales[scale], self._ratios[ratio])
         residual = residual[:, self._observations.inputs[:, 0].argsort()]
         total = residual.square().sum(1).clamp_min(1e-300)
         products = [(residual[:, lag:] * residual[:, :-lag]).sum(1) / total for lag in range(1, _LAGS + 1)]
@@ -220,9 +220,7 @@ class _Search:
         most = min(1 + self._options.n_restarts, minima.shape[1])
         loss, place = minima.topk(most, dim=1, largest=False)
         place = torch.where(loss.isfinite(), place, 0)
-        scale = self._scales[place // len(self._ratios)].unsqueeze(-1) if self._fixed is None else self._fixed
-        length_scale = scale.expand(*place.shape, self._observations.inputs.shape[1])
-        return length_scale, self._ratios[place % len(self._ratios)], loss
+        return self._scales[place // len(self._ratios)], self._ratios[place % len(self._ratios)], loss
 
     def _descend(self, chosen: Int64[Tensor, " a"]) -> Float[Tensor, "a c"]:
         """BFGS from the deepest valleys of the chosen processes; of each the best end."""
