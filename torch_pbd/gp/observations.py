@@ -285,5 +285,6 @@ def condition(
         root, solved = None, basis.counts.sqrt()[:, None] * solved
     else:
         root, solved = basis.root.clone(memory_format=torch.contiguous_format), basis.root.mT @ solved
-    weights = (weight.contiguous() for weight in solved.unbind(-1))
-    return LatentGP(basis.nodes.clone(), *weights, hyperparameters, basis.counts.clone(), kernel, root), jitter
+    weight, value_weight = (part.contiguous() for part in solved.unbind(-1))
+    nodes, counts = basis.nodes.clone(), basis.counts.clone()
+    return LatentGP(nodes, weight, value_weight, hyperparameters, counts, kernel, root), jitter
