@@ -95,23 +95,11 @@ def preview(values: Sequence[object], limit: int = 12) -> str:
     return f"[{shown}, ... {len(values)} in all]" if len(values) > limit else f"[{shown}]"
 
 
-class _Own(np.ndarray[Any, np.dtype[np.float64]]):
-    """Memory of arrays that are locked; read-only memory of any other kind may be a caller's, who can write to it."""
-
-
 def frozen(array: NDArray[Any]) -> Floats:
-    """Read-only float64 array: a copy, but for one that is :func:`locked`."""
-    own = isinstance(array.base, memoryview) and isinstance(array.base.obj, _Own)
-    copy = np.array(array, dtype=np.float64, order="C", copy=None if own else True)
-    return copy if copy is array else locked(copy)
-
-
-def locked(array: Floats) -> Floats:
-    """Read-only view that nobody can make writeable again, as an array with memory of its own could be.
-
-    Whoever made the array keeps no other view of it.
-    """
-    return np.asarray(array.view(_Own).data.toreadonly())
+    """Read-only float64 array over bytes, which nobody can write to: a copy, but for one that is such already."""
+    if isinstance(array.base, bytes) and array.dtype == np.float64 and array.flags.c_contiguous:
+        return array
+    return np.ndarray(array.shape, np.float64, np.asarray(array, dtype=np.float64).tobytes())
 
 
 def _as_list(values: Any, name: str) -> list[Any]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.data.recordings import Missing, as_texts, from_common_origin, locked, preview
+from torch_pbd.data.recordings import Missing, as_texts, from_common_origin, frozen, preview
 from torch_pbd.data.units import TIMES
 from torch_pbd.files.memory import require_memory
 
@@ -150,7 +150,7 @@ class Wanted:
             for name, values in zip(chosen.names, columns, strict=True):
                 if values.dtype.kind not in "biuf":
                     raise ValueError(f"column {name!r} holds {values.dtype}, no numbers: leave it out by outputs=.")
-            positions.append(locked(np.stack(columns, axis=1, dtype=np.float64)))  # which need not be copied
+            positions.append(frozen(np.stack(columns, axis=1)))
             times.append(_column(signals, chosen.time) if chosen.time else np.arange(len(columns[0])))
             if hasattr(stamp := next(iter(times[-1]), None), "isoformat"):  # one of Python's
                 raise checks.refusal(stamp, "time", "a datetime64 or a number", "convert the column")

@@ -196,7 +196,7 @@ def describe(demonstrations: Demonstrations, source: str) -> str:
 def figure_of(model: CovarianceRegressor, demonstrations: Demonstrations, name: str, input: Input = "time") -> Figure:
     """Every output over the input with its band, beyond the data too; two outputs also in the plane."""
     n_outputs = demonstrations.n_outputs
-    figure, plane, bands = style.panels(n_outputs, 2 if n_outputs == 2 else 0, style.quiet_figure)
+    figure, plane, bands = style.panels(n_outputs, 2 if n_outputs == 2 else 0, Figure)
     X, y, _ = demonstrations.stack(input)
     plotting.plot_model_bands(model, X, y, bands)
     shown = demonstrations if input == "time" else demonstrations.align()
@@ -212,7 +212,7 @@ def figure_of(model: CovarianceRegressor, demonstrations: Demonstrations, name: 
 def figure_of_recordings(demonstrations: Demonstrations, name: str) -> Figure:
     """Every output over the time, at most nine of them."""
     n = min(demonstrations.n_outputs, 9)
-    figure, _, bands = style.panels(n, make=style.quiet_figure)
+    figure, _, bands = style.panels(n, make=Figure)
     for output, ax in enumerate(bands):
         plotting.plot_demonstrations(demonstrations, [output], ax)
     figure.suptitle(name if n == demonstrations.n_outputs else f"{name}: 9 of {demonstrations.n_outputs} outputs")

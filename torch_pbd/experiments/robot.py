@@ -39,7 +39,7 @@ def run_robot(
             raise ConfigError(
                 f"data: a pose has three positions and a rotation, not the outputs {demonstrations.names}."
             )
-        axes = poses.draw_poses(demonstrations, poses.draw_recorded_poses, 3, style.quiet_figure)
+        axes = poses.draw_poses(demonstrations, poses.draw_recorded_poses, 3, Figure)
         folder.write_figure(axes[0].figure, "figure6_task")
     table: list[dict[str, Any]] = []
     rows: list[dict[str, Any]] = []
@@ -189,7 +189,7 @@ def pushes_figure(run: Run, name: str) -> Figure:
 
 def pose_variability_figure(run: Run, demonstrations: Demonstrations, name: str) -> Figure:
     """Planned path, deviations and empirical ones in principal axes, and stiffness there, of both blocks: Figure 7."""
-    figure, (space,), bands = style.panels(4, 3, style.quiet_figure)
+    figure, (space,), bands = style.panels(4, 3, Figure)
     plotting.plot_demonstrations(demonstrations, [0, 1, 2], space)
     poses.draw_pose_schedule(run.schedule, space, bands)
     phase, covariances = pose_covariances(demonstrations)

@@ -38,12 +38,11 @@ def run_simulation(
     n_seeds: int,
     n_inputs: int,
     n_demos: int,
-    max_folds: int,
-    n_jobs: int | None,
+    **options: Any,
 ) -> str:
     """Table I, as text, for each reading of eq. (14): medians over ``n_seeds`` seeds, and the paper's figures beside.
 
-    Writes metrics, and of each model, fitted to the data of the first reading and seed 0, the file and the figure.
+    Compares by options of `compare_models`; writes metrics, and of each model, fitted to the data of the first reading and seed 0, the file and the figure.
     """
     rows: list[dict[str, Any]] = []
     for reading in readings:
@@ -51,9 +50,7 @@ def run_simulation(
         for seed in steps(range(n_seeds), f"simulation ({reading})", n_seeds):
             data = make_paper_simulation(n_inputs, n_demos, reading=reading, random_state=seed)
             truth = partial(paper_covariance, reading=reading)
-            scores = compare_models(
-                models, *data, truth=truth, max_folds=max_folds, n_jobs=n_jobs, finished=folder.finished
-            )
+            scores = compare_models(models, *data, truth=truth, finished=folder.finished, **options)
             for name, score in scores.items():
                 found[name].append(score.row)
             if not rows and not seed:

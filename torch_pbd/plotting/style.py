@@ -47,14 +47,9 @@ POSITION = Kind(slice(0, 3), "along", "force", "N", "mm", 1e3, "N/m")
 ROTATION = Kind(slice(3, 6), "about", "torque", "Nm", "deg", 180.0 / np.pi, "Nm/rad")
 
 
-def quiet_figure(size: tuple[float, float]) -> Figure:
-    """Figure of ``size`` in inches that pyplot does not know, so that nothing needs closing."""
-    return Figure(figsize=size)
-
-
 def figure_grid(n_rows: int, n_columns: int, size: tuple[float, float], **options: Any) -> tuple[Figure, Any]:
-    """Quiet figure of ``size`` in inches, and its Axes."""
-    figure = quiet_figure(size)
+    """Figure of ``size`` in inches that pyplot does not know, so that nothing needs closing, and its Axes."""
+    figure = Figure(size)
     return figure, figure.subplots(n_rows, n_columns, squeeze=False, **options)
 
 
