@@ -12,9 +12,9 @@ from torch_pbd.checks import Floats
 from torch_pbd.data.alignment import check_overlap, unit_phases
 from torch_pbd.data.description import Description, describe
 from torch_pbd.data.editing import Alignment, Editing
-from torch_pbd.data.poses import as_chart, as_columns, as_reference, unwrapped
+from torch_pbd.data.poses import as_chart, as_columns, as_reference, find_suspects, unwrapped
 from torch_pbd.data.recordings import Missing, as_names, as_recordings, as_units, frozen, preview
-from torch_pbd.data.units import TIMES, check_unit, find_suspects
+from torch_pbd.data.units import TIMES, check_unit
 from torch_pbd.data.wanted import OPTIONS, Wanted, check_options
 from torch_pbd.exceptions import InvalidParameterError
 

@@ -11,9 +11,10 @@ from torch_pbd.checks import Floats
 from torch_pbd.console import format_table
 from torch_pbd.data.alignment import check_overlap
 from torch_pbd.data.editing import Editing
+from torch_pbd.data.poses import quaternions
 from torch_pbd.data.recordings import preview
 from torch_pbd.data.sampling import extents, still
-from torch_pbd.data.units import ANGLES, LENGTHS, TIMES, quaternions
+from torch_pbd.data.units import ANGLES, LENGTHS, TIMES
 from torch_pbd.exceptions import InvalidParameterError, UnimodalityWarning
 
 _MOST_ROWS = 20

@@ -8,10 +8,10 @@ import numpy as np
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.data.alignment import comparable_scale, dtw_warps, interpolate, times_from_start, unit_phases
-from torch_pbd.data.poses import charted, unwrapped, with_whole_rotation
+from torch_pbd.data.poses import charted, find_suspects, unwrapped, with_whole_rotation
 from torch_pbd.data.recordings import MIN_SAMPLES, as_recordings, as_texts, frozen, preview
 from torch_pbd.data.sampling import LEAST_SAMPLES, smoothing_spline, still
-from torch_pbd.data.units import ANGLES, LENGTHS, TIMES, check_unit, find_suspects
+from torch_pbd.data.units import ANGLES, LENGTHS, TIMES, check_unit
 from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.files.memory import require_much
 from torch_pbd.rotations import Chart

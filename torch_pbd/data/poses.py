@@ -1,4 +1,4 @@
-"""Rotations and angles: quaternions to and from a chart around their mean, and unwrapping."""
+"""Rotations and angles: recognized in recordings, to and from a chart around their mean, and unwrapped."""
 
 import math
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.data.alignment import interpolate, unit_phases
 from torch_pbd.data.recordings import as_names, as_recordings, as_texts, as_units, frozen, preview
-from torch_pbd.data.units import ANGLES, OFF_SPHERE
+from torch_pbd.data.units import ANGLES
 from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.rotations import Chart, continuous, mean
 
@@ -21,6 +21,15 @@ QUATERNION = ("qw", "qx", "qy", "qz")
 # is 15 degrees wide has two standard deviations left at 150.
 _FAR, FURTHEST = 120.0, 150.0
 _N_PHASES = 201  # phases of each recording in the mean, so that duration and sampling rate do not weigh in
+
+# Four numbers rounded to three decimals: their squared sum is off by up to 2 sum |q| 0.0005, at most 0.002. What varies
+# little around a point of norm 1 is a quaternion only if it keeps to the sphere far better than it varies.
+_OFF_SPHERE, _OFF_SPHERE_SHARE = 2.5e-3, 0.1
+_SAMPLES_ON_SPHERE = 0.9  # least share of samples of norm 1, as interpolation between q and -q leaves the sphere
+# Tolerance in turns of a jump's size, and of other steps of an angle that was sampled densely enough.
+_QUARTER = 0.25
+_MOST_JUMPS = 0.1  # largest share of steps that jump; a signal that jumps more often is not an angle
+_LARGEST_ANGLE = 1e9  # differences of far larger numbers may overflow
 
 
 def as_reference(reference: Any, times: Any, positions: Any, names: Any, units: Any) -> Floats:
@@ -49,7 +58,7 @@ def as_chart(times: Any, positions: Any, names: Any, units: Any, rotation: Any, 
     for k, position in enumerate(positions):
         norm = np.linalg.norm(position[:, columns], axis=1)
         what, remedy = f"the norm of {', '.join(chosen)} in positions[{k}]", "missing='drop' leaves zeros out"
-        checks.require(np.abs(norm**2 - 1.0) <= OFF_SPHERE, norm, what, "1", f"name a rotation; {remedy}")
+        checks.require(np.abs(norm**2 - 1.0) <= _OFF_SPHERE, norm, what, "1", f"name a rotation; {remedy}")
         turns.append(position[:, columns] / norm[:, np.newaxis])
     kept = [i for i in range(len(names)) if i not in columns]
     if units is not None and not isinstance(units, str) and len(units) == len(names):
@@ -63,10 +72,7 @@ def as_chart(times: Any, positions: Any, names: Any, units: Any, rotation: Any, 
 def charted(
     times: Sequence[Floats], places: Sequence[Floats], quaternions: Sequence[Floats]
 ) -> tuple[list[Floats], Floats]:
-    """Outputs (T_k, p + 3) of poses, with rotations in the chart around their Frechet mean, and that mean (4,).
-
-    The mean is of each recording at evenly spaced phases. Far rotations raise an error.
-    """
+    """Outputs (T_k, p + 3) of poses, with rotations in the chart around their Frechet mean, and that mean (4,)."""
     phases = np.linspace(0.0, 1.0, _N_PHASES)
     pairs = zip(unit_phases(times), quaternions, strict=True)
     together = np.concatenate([interpolate(own, continuous(turn), phases) for own, turn in pairs])
@@ -134,3 +140,58 @@ def _check_reach(times: Sequence[Floats], turns: Sequence[Floats]) -> None:
         raise InvalidParameterError(f"{what}, must be at most {FURTHEST:.0f}: {remedy}.")
     if furthest > _FAR:
         checks.warn(f"{what.capitalize()}, and {FURTHEST:.0f} are refused: {remedy}.")
+
+
+def find_suspects(positions: Sequence[Floats], names: Sequence[str], units: Sequence[str] | None) -> tuple[str, ...]:
+    """Warnings about non-Euclidean outputs, with remedies; without units, an angle may be in rad or deg."""
+    found = []
+    for first in quaternions(positions, len(names)):
+        four = names[first : first + 4]
+        order = tuple(sorted(four, key=lambda name: name[-1:]))
+        known = [name[-1:] for name in order] == [*"wxyz"]
+        what = f"Outputs {', '.join(four)} have the squared sum 1, as unit quaternions do, whose mean is no rotation"
+        given = order if known else "(w, x, y, z), of which only you know the names"
+        found.append(f"{what}: say which they are, in the order w x y z, rotation={given}, or leave them out.")
+    for i, name in enumerate(names):
+        angle = _wrapped(positions, i, None if units is None else units[i])
+        if angle:
+            what = f"Output {name} jumps by a turn, {2.0 * math.pi / ANGLES[angle]:.4g} {angle}, between two samples"
+            found.append(f"{what}, and so does a mean. Say angles=[{name!r}], and that its unit is {angle!r}.")
+    return tuple(found)
+
+
+def quaternions(positions: Sequence[Floats], n_outputs: int) -> list[int]:
+    """Indices of outputs that begin four columns of unit quaternions."""
+    found, first = [], 0
+    while first + 4 <= n_outputs:
+        columns = [_column(positions, i) for i in range(first, first + 4)]
+        off = np.abs(sum(map(np.square, columns)) - 1.0)
+        spread = max(map(np.ptp, columns))
+        if spread > 0.0 and np.mean(off <= min(_OFF_SPHERE, _OFF_SPHERE_SHARE * spread)) >= _SAMPLES_ON_SPHERE:
+            found.append(first)
+        first += 4 if first in found else 1
+    return found
+
+
+def _column(positions: Sequence[Floats], i: int) -> Floats:
+    """One output of all demonstrations, clipped so that differences do not overflow."""
+    return np.concatenate([position[:, i] for position in positions]).clip(-_LARGEST_ANGLE, _LARGEST_ANGLE)
+
+
+def _wrapped(positions: Sequence[Floats], i: int, unit: str | None) -> str | None:
+    """Unit in which an output jumps by a turn; None if it does not."""
+    whole = max(float(y[:, i].max()) for y in positions) - min(float(y[:, i].min()) for y in positions)
+    for angle in ANGLES if unit is None else {unit} & set(ANGLES):
+        turn = 2.0 * math.pi / ANGLES[angle]
+        # Most outputs cover less than a turn, and are not looked at step by step.
+        if whole < (1.0 - _QUARTER) * turn or (unit is None and whole > 1.01 * turn):
+            continue
+        ends = np.cumsum([len(position) for position in positions])[:-1] - 1  # between two demonstrations
+        step = np.delete(np.abs(np.diff(_column(positions, i))), ends)
+        jumps = np.abs(step - turn) <= _QUARTER * turn
+        other = step[~jumps].max(initial=0.0)
+        # An unwrapped signal continues after the jump as smoothly as elsewhere.
+        smooth = np.abs(step[jumps] - turn) <= max(3.0 * other, 1e-3 * turn)
+        if other < _QUARTER * turn and 0 < jumps.sum() <= _MOST_JUMPS * len(step) and smooth.all():
+            return angle
+    return None

@@ -72,14 +72,11 @@ class FinishedFits:
 
 
 def fit_once(model: Any, *data: Any, finished: FinishedFits | None = None) -> tuple[Any, float]:
-    """Fitted model, loaded or fitted to X, y and groups, or to Demonstrations, and kept; and the seconds of its fit.
-
-    What is no class of this package is always fitted.
-    """
+    """Fitted model, loaded or fitted to X, y and groups, or to Demonstrations, and kept; and the seconds of its fit."""
     from torch_pbd.persistence import load, save
     from torch_pbd.persistence.plain import is_ours
 
-    if finished is None or not is_ours(model):
+    if finished is None or not is_ours(model):  # of other classes there are no files
         return _timed_fit(model, *data)
     key = _key(model, *data)
     found = finished.files(key)

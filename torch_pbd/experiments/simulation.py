@@ -42,7 +42,8 @@ def run_simulation(
 ) -> str:
     """Table I, as text, for each reading of eq. (14): medians over ``n_seeds`` seeds, and the paper's figures beside.
 
-    Compares by options of `compare_models`; writes metrics, and of each model, fitted to the data of the first reading and seed 0, the file and the figure.
+    Compares by options of `compare_models`; writes metrics, and of each model, fitted to the data of the first reading
+    and seed 0, the file and the figure.
     """
     rows: list[dict[str, Any]] = []
     for reading in readings:
