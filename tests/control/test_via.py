@@ -137,6 +137,19 @@ def test_nothing_to_condition_on_changes_nothing(controller):
     assert controller.predict_cov(np.zeros((0, 1))).shape == (0, 2, 2)
 
 
+def test_a_controller_is_conditioned_within_its_movement():
+    """Recordings of a clock that starts at different times count from 0 s; a common start is one up to a sample."""
+    shown = demonstrations()
+    apart = Demonstrations([TIME + 5.0 + 0.1 * k for k in range(len(shown))], shown.positions, units="m")
+    controller = DMPController(ProMPBaseline()).fit(apart)
+    for time in (6.0, -0.1, 2.1):
+        with pytest.raises(
+            ValueError, match=rf"times\[1\] is {time} s, must be within the movement, 0 to 2: count from"
+        ):
+            controller.condition([1.0, time], [controller.goal_] * 2)
+    controller.condition([-0.02, 2.02], [controller.start_, controller.goal_], noise_scale=1e-3)
+
+
 @pytest.mark.filterwarnings("ignore:via", "ignore:The reproduced movement is")
 @pytest.mark.parametrize("phase_input", ["time", "s", "log_s"])
 def test_what_is_known_stays_where_an_unlikely_point_follows(phase_input):

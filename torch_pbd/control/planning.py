@@ -108,7 +108,8 @@ class Planning(BaseEstimator):
         Parameters
         ----------
         times : array-like of shape (m,)
-            Times in the units and origin of the demonstrations.
+            Times in the units and origin of the demonstrations, within the movement: from ``start_time_`` on, and no
+            later than ``duration_`` after it.
         positions : array-like of shape (m, d), or (m, p + 4) for poses
             Positions in the units of the recordings, NaN where an output is not given. Poses are p positions and a
             quaternion w x y z, or outputs; a rotation is given as a whole or not at all.
@@ -117,7 +118,13 @@ class Planning(BaseEstimator):
             that a robot measured have one, such as 1 mm. Taken as exact where demonstrations agree to much less, they
             are a large deviation, with which other outputs may move far; this warns.
         """
-        time = self._movement_time(checks.array(times, "times", ("m",))[:, np.newaxis])
+        times = checks.array(times, "times", ("m",))
+        time = self._movement_time(times[:, np.newaxis])
+        # Recordings with a common start begin up to a sample before or after it.
+        inside = np.abs(time - 0.5 * self.duration_) <= (0.5 + 1.0 / self.n_steps) * self.duration_
+        end = self.start_time_ + self.duration_ / self.time_scale_
+        must, remedy = f"within the movement, {self.start_time_:.10g} to {end:.10g}", "count from its start_time_"
+        checks.require(inside, times, "times", must, remedy, self.time_unit_)
         position = self.outputs_.rows(positions, "positions")
         if position.shape != (len(time), self.n_outputs_):
             raise ValueError(f"positions has shape {position.shape}, must have shape ({len(time)}, {self.n_outputs_}).")

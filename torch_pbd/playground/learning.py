@@ -76,14 +76,13 @@ def adjust(learned: Learned, settings: Settings) -> Answer:
     for name, fitted in learned.controllers.items():
         # The fitted model is frozen: gains are made anew, nothing is learned again.
         learned.controllers[name] = _controller(FrozenEstimator(fitted.covariance_), settings).fit(learned.strokes)
-    learned.bent = _bent(learned)
+    learned.bent = _bent(learned, learned.via)
     return follow(learned)
 
 
 def bend(learned: Learned, via: list[tuple[float, float, float]]) -> Answer:
     """Movement of the first model through points: rows of time in s and position in m."""
-    learned.via, learned.schedule = via, None
-    learned.bent = _bent(learned)
+    learned.bent, learned.via, learned.schedule = _bent(learned, via), via, None
     return picture(learned.bent, next(iter(learned.controllers)), drawn=False)
 
 
@@ -157,11 +156,11 @@ def _controller(covariance: Any, settings: Settings) -> DMPController:
     )
 
 
-def _bent(learned: Learned) -> DMPController:
+def _bent(learned: Learned, via: list[tuple[float, float, float]]) -> DMPController:
     controller = next(iter(learned.controllers.values()))
-    if not learned.via:
+    if not via:
         return controller
-    points = np.array(learned.via)
+    points = np.array(via)
     return controller.condition(points[:, 0], points[:, 1:])
 
 
