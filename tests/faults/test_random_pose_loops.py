@@ -81,7 +81,7 @@ def norms(twists):
     return np.maximum(np.linalg.norm(twists[:, :3], axis=1), LEVER * np.linalg.norm(twists[:, 3:], axis=1))
 
 
-ALL = 1000 if settings.get_current_profile_name() == "thorough" else 200
+ALL = 1000 if settings.get_current_profile_name() == "thorough" else 100
 
 
 @pytest.mark.parametrize("seeds", [range(12), pytest.param(range(12, ALL), marks=pytest.mark.slow)], ids=["few", "all"])
