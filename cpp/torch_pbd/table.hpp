@@ -30,6 +30,10 @@ public:
             throw std::invalid_argument("the schedule has " + std::to_string(schedule.n_positions) + " positions of " +
                                         std::to_string(schedule.n_outputs) + " outputs, must have " +
                                         std::to_string(n_positions<N, M>) + " of " + std::to_string(N) + ".");
+        const auto units = schedule.labels.find("units");
+        for (const char* other : {"\"km\"", "\"dm\"", "\"cm\"", "\"mm\"", "\"um\"", "\"deg\""})
+            if (units != schedule.labels.end() && units->second == other)
+                throw std::invalid_argument("units of schedule is " + units->second + ", must be m or rad.");
         const std::vector<double>& knots = schedule.time;
         end = knots.back() - knots.front();
         constexpr double rounding = 1e-3, most = 4e6;  // of a tick; rows: an hour at 1 kHz

@@ -1,10 +1,13 @@
 """Schedules of joint angles are in rad, Nm and Nm/rad wherever they are shown."""
 
+from dataclasses import replace
+
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from torch_pbd.control import AdmittancePlant, Schedule, simulate, simulate_many
+from torch_pbd.control import AdmittancePlant, RealTimeAdmittance, Schedule, simulate, simulate_many
+from torch_pbd.data.units import ANGLES, LENGTHS
 
 
 @pytest.fixture(scope="module")
@@ -41,3 +44,12 @@ def test_figures_say_about_which_joint_and_in_which_unit(joints, run):
     assert moved.lines[0].get_label() == stiffness.lines[0].get_label() == "about shoulder"
     np.testing.assert_array_equal(moved.lines[0].get_ydata(), run.deviation[:, 0])
     plt.close("all")
+
+
+@pytest.mark.parametrize("move", [simulate, simulate_many, RealTimeAdmittance])
+def test_forces_move_what_is_in_metres_or_radians(joints, move):
+    for units in {*LENGTHS, *ANGLES} - {"m", "rad"}:
+        with pytest.raises(ValueError, match=f"units of schedule is '{units}', must be 'm' or 'rad'"):
+            move(replace(joints, units=units))
+    for units in ("rad", "px", None):
+        move(replace(joints, units=units))

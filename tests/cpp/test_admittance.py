@@ -250,6 +250,12 @@ def test_another_mass_than_that_of_the_damping_is_refused(tmp_path):
         CppAdmittance(tmp_path / "pose.csv", 6, is_pose=True, mass=2.0)
 
 
+def test_positions_in_millimetres_are_refused(tmp_path):
+    replace(constant(100.0, 10.0), units="mm").save(tmp_path / "schedule.csv")
+    with pytest.raises(ValueError, match='units of schedule is "mm", must be m or rad'):
+        CppAdmittance(tmp_path / "schedule.csv", 1)
+
+
 @pytest.mark.slow
 def test_the_example_serves_a_loop_and_allocates_nothing(tmp_path):
     make_schedule(2, duration=1.0).save(tmp_path / "schedule.csv")

@@ -20,6 +20,7 @@ _ROUNDING = 1e-3
 _SAME_MASS = 1e-3
 UNEVEN = 1e-6
 """Share of a tick that counts as rounding of its length: times of an hour at 1 kHz err by 5e-10 of one in float64."""
+_NOT_SI = ("km", "dm", "cm", "mm", "um", "deg")  # lengths and angles that are known, and neither m nor rad
 
 
 def count_rows(duration: float, rate: float) -> int:
@@ -127,6 +128,16 @@ def damped_rows(schedule: Any, damping_ratio: float, law: Any) -> dict[str, Any]
     squared, axes = np.linalg.eigh(np.linalg.solve(factor, half.swapaxes(1, 2)))
     modes = factor @ axes * squared.clip(0.0)[:, np.newaxis] ** 0.25
     return rows | {"damping": 2.0 * ratio * modes @ modes.swapaxes(1, 2)}
+
+
+def refuse_other_units(schedule: Any) -> None:
+    """Refuse a schedule whose gains, in N/m or Nm/rad, are not those of its positions: forces would move it too little.
+
+    Units that nobody knows pass: gains may be in them too.
+    """
+    if schedule.units in _NOT_SI:
+        must, remedy = "'m' or 'rad', as of N/m and Nm/rad", "convert position, velocity, acceleration and covariance"
+        raise checks.refusal(schedule.units, "units of schedule", must, remedy)
 
 
 def warn_of_another_mass(schedule: Any, mass: Floats, who: str) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.control.schedule.rows import even_step, warn_of_another_mass
+from torch_pbd.control.schedule.rows import even_step, refuse_other_units, warn_of_another_mass
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.plant import AdmittancePlant
 from torch_pbd.control.simulation.rollout import Rollout, run_task, warn_if_far
@@ -165,7 +165,7 @@ def simulate_many(
 
 def _task_of(schedule: Schedule, plant: AdmittancePlant | None) -> Task:
     """Task of a plant that follows a schedule row by row; warns if its mass is not that of the schedule."""
-    checks.instance(schedule, "schedule", Schedule)
+    refuse_other_units(checks.instance(schedule, "schedule", Schedule))
     plant = checks.instance(plant, "plant", AdmittancePlant, optional=True) or AdmittancePlant(None)
     rows = (schedule.position, schedule.velocity, schedule.stiffness, schedule.damping)
     position, velocity, stiffness, damping = map(torch.tensor, rows)  # of copies: its own are read-only
