@@ -122,6 +122,30 @@ def test_words_for_missing_cells_are_dropped_on_request(tmp_path, cell):
         assert load_text(tmp_path, text, missing="drop").n_steps == (2,)
 
 
+@pytest.mark.parametrize("blank", ["", "NaN"])
+def test_a_time_that_is_missing_changes_no_other(tmp_path, blank):
+    dates = "time,x\n" + "".join(
+        f"{stamp},{i}.5\n" for i, stamp in enumerate(["10:00:00", blank, "10:00:01", "10:00:02"])
+    )
+    for text in (dates, dates.replace("10:", "2024-01-01 10:")):
+        with pytest.warns(MissingDataWarning, match="1 of 4"):
+            assert load_text(tmp_path, text, missing="drop").times[0].tolist() == [0.0, 1.0, 2.0]
+    stamps = "time,x\n" + "".join(f"{1_700_000_000_000_000_000 + 2**30 * i},{i}.5\n" for i in range(3))
+    (tmp_path / "whole.csv").write_text(stamps)
+    (tmp_path / "set.csv").write_text(f"{stamps}{blank},3.5\n")
+    with pytest.warns(MissingDataWarning, match="1 of 4"):
+        first, second = load_demonstrations(tmp_path / "*.csv", missing="drop", time_unit="ns").times
+    np.testing.assert_array_equal(first, second)
+
+
+@pytest.mark.parametrize(
+    "stamps", [("58.5", "59.5", "00:01:00.5"), ("00:00:58", "59", "60"), ("2024-01-01 10:00:00", "10:00:01", "11")]
+)
+def test_times_of_several_kinds_in_a_column_are_refused(tmp_path, stamps):
+    with pytest.raises(DataFormatError, match=r"line \d, column 'time': '.*' is a .*, must be a .* as those above"):
+        load_text(tmp_path, "time,x,y\n" + lines(*stamps))
+
+
 def test_a_column_that_numbers_the_demonstrations_is_found_out(tmp_path):
     trials, stamps = np.repeat([0, 1, 2], 20), np.arange(60) * 0.1
     text = "trial,time,x\n" + "".join(f"{k},{t},{np.sin(t)}\n" for k, t in zip(trials, stamps, strict=True))

@@ -173,7 +173,7 @@ class Wanted:
             unit = checks.choice(self.time_unit or "s", "time_unit", TIMES).replace("min", "m")  # as NumPy has it
             origin, step = np.fmin.reduce([np.fmin.reduce(time) for time in grids]), np.array(1, dtype=f"m8[{unit}]")
             grids = [(time - origin).astype("m8[ns]") / step for time in grids]
-        elif kinds <= {"i", "u"} and len(parts) > 1:  # of one, errors tell the stamps
+        elif kinds <= {"i", "u", "f"} and len(parts) > 1:  # of one, errors tell the stamps
             grids = from_common_origin(grids)
         return [part | {"times": [grids.pop(0) for _ in part["times"]]} for part in parts]
 

@@ -79,6 +79,7 @@ class _Table:
             raise ValueError(f"line {self.n_before}: {str(error).rstrip('.')}.") from error
         self.delimiter, self.start = candidates[headers.index(self.header)], file.tell()
         self.demo, self.time = (place and place[0] for place in (self.chosen.demo, self.chosen.time))
+        self.kind: str | None = None  # of the times
 
     def read_at_once(self) -> dict[str, NDArray[Any]] | None:
         """Same as :meth:`read_lines` in a sixth of the time; None if some cell needs special treatment."""
@@ -114,7 +115,7 @@ class _Table:
         converters |= {self.demo: number_of, self.time: self._read_time}
         converters.pop(None, None)
         # Arrays of numbers take 8 bytes for each, where lists take 32.
-        columns: dict[str, Any] = {name: [] if name == self.time else array("d") for name in converters}
+        columns: dict[Any, Any] = {name: [] if name == self.time else array("d") for name in converters}
         self.file.seek(self.start)
         reader, line, name = csv.reader(self.file, delimiter=self.delimiter), self.n_before + 1, None
         try:
@@ -133,6 +134,8 @@ class _Table:
         except (ValueError, csv.Error) as error:
             place = "" if name is None else f", column {name!r}"
             raise ValueError(f"line {line}{place}: {error}") from error
+        if self.kind not in (None, "a number"):  # blanks of dates are NaT
+            columns[self.time] = [np.datetime64("NaT") if stamp != stamp else stamp for stamp in columns[self.time]]
         return {name: np.array(values) for name, values in columns.items()}
 
     def _read_number(self, cell: str) -> float:
@@ -152,6 +155,11 @@ class _Table:
     def _read_time(self, cell: str) -> Any:
         """Time of a cell: stamps in ns as integers, dates and times of day since 1970 or midnight as those of NumPy."""
         match = _CLOCK.fullmatch(cell.strip())
+        kind = "a number" if match is None else "a date" if match[1] else "a time of day"
+        if cell.strip().lower() not in _MISSING:
+            if kind != (self.kind or kind):
+                raise ValueError(f"{cell!r} is {kind}, must be {self.kind} as those above: write all in one way.")
+            self.kind = kind
         if match is None:
             return int(cell) if _WHOLE.fullmatch(cell.strip()) else self._read_number(cell)
         day, hours, minutes, seconds, fraction, east, more = match.groups()
