@@ -31,7 +31,6 @@ _BRAKE = 0.2  # largest share of the duration for braking a movement that was cu
 # there. Movements that keep above half of their largest are meant to pass, and a robot stops 0.1 m/s within 1 mm at
 # 5 m/s^2, and 0.3 rad/s within 0.3 degrees at 10 rad/s^2.
 _CUT, _STEADY, _STOPPED = 0.1, 0.5, (0.1, 0.3)
-_ROUNDING = 1e-9  # rounding as a share of the duration or of the largest position
 _BRIEFEST = 1e-100  # s: squares of what is briefer, or of its inverse, are no numbers
 _CYCLES = 0.01, 1e6  # bounds of the cutoff in cycles per movement: fewer give a line, more do not smooth
 # Time constants in a movement. A reach of 0.6 m is reproduced to 0.1 mm with 1e10 of alpha; rounding of the spring's
@@ -111,7 +110,7 @@ class Reproduction:
             mean = movements.recorded_mean[:, own]
             errors.append(error := float(np.sqrt(np.square(path[:, own] - mean).sum(axis=1).mean())))
             extent = float(np.linalg.norm(np.ptp(bounds[:, own], axis=0)))
-            if error > _FAR * extent + _ROUNDING * float(np.abs(mean).max()):
+            if error > _FAR * extent + checks.ROUNDING * float(np.abs(mean).max()):
                 remedy = "phase_input='time'" if self.phase_input == "s" else "a higher cutoff, or more n_steps"
                 checks.warn(
                     f"The reproduced movement is {error:.3g}{unit} off the mean of the demonstrations, "
@@ -203,11 +202,11 @@ class Reproduction:
         brake = max(0.0, min(needed, _BRAKE * end, 2.0 * (float(passed[-1]) - end)))
         # The rate of movement time falls from 1 to 0 by a smooth step of u; the time moved is its integral,
         # brake (u - u^3 + u^4 / 2), half of the brake when it stands.
-        late = (passed - end) / end
-        share = np.clip(late * end / brake + 0.5, 0.0, 1.0) if brake > _ROUNDING * end else 1.0 * (late > _ROUNDING)
+        late, is_brief = (passed - end) / end, brake <= checks.ROUNDING * end
+        share = 1.0 * (late > checks.ROUNDING) if is_brief else np.clip(late * end / brake + 0.5, 0.0, 1.0)
         moved = np.minimum(passed, end - 0.5 * brake) + brake * (share - share**3 + 0.5 * share**4)
         rate = 1.0 - share**2 * (3.0 - 2.0 * share)
-        slope = -6.0 * share * (1.0 - share) / brake if brake > _ROUNDING * end else np.zeros(len(passed))
+        slope = np.zeros(len(passed)) if is_brief else -6.0 * share * (1.0 - share) / brake
         return np.minimum(moved, end), rate, slope, np.maximum(moved, passed - 0.5 * brake)
 
 

@@ -116,10 +116,10 @@ class Loop:
 
     def __init__(self, task: Task, state: State, generator: torch.Generator | None) -> None:
         self._task, plant, loop = task, task.plant, task.plant.position_loop
-        self._deviation, self._velocity = state[0] - task.position[..., 0, :], state[1]
-        # The robot behind its loop, and the commands that it has yet to follow, are deviations too.
-        self._robot, self._follow = (self._deviation, self._velocity), loop and loop.transition(task.dt, state[0])
-        self._commands = [self._deviation] * (loop.delay_steps if loop else 0)
+        # What is commanded, the robot behind its loop, and the commands that it has yet to follow are all deviations.
+        self._command = self._robot = state[0] - task.position[..., 0, :], state[1]
+        self._follow = loop and loop.transition(task.dt, state[0])
+        self._waiting = [self._command[0]] * (loop.delay_steps if loop else 0)
         self._read = plant.sensor and plant.sensor.start(state[0], task.dt, generator)
         gains = task.stiffness, task.damping, task.mass
         self._filter = plant.stiffness_filter and plant.stiffness_filter.start(*gains)
@@ -127,10 +127,10 @@ class Loop:
 
     def run(self, tick: int, force: Tensor) -> dict[str, Tensor]:
         """Fields of a Rollout at the start of a tick under a force (..., d), and the deviation that is commanded."""
-        task, commanded = self._task, self._deviation
+        task, commanded = self._task, self._command[0]
         desired = task.position[..., tick, :]
         stiffness, damping, mass = (gain[..., tick, :, :] for gain in (task.stiffness, task.damping, task.mass))
-        away, speed = (commanded, self._velocity) if self._follow is None else self._robot
+        away, speed = self._command if self._follow is None else self._robot
         measured = total = force + self._wall(away + desired, speed)
         record = {"deviation": away, "commanded": commanded, "velocity": speed, "force": total}
         if self._read is not None:
@@ -145,28 +145,28 @@ class Loop:
             each = tick_map(stiffness, damping, mass, task.dt)
         push = (damping @ task.velocity[..., tick, :].unsqueeze(-1)).squeeze(-1) + task.inertial_force[..., tick, :]
         for part in range(task.plant.substeps):
-            before = self._deviation, self._velocity
+            before = self._command
             if part:  # the walls are evaluated anew in each part of the tick
                 measured = force + self._wall(before[0] + desired, before[1])
             held = (measured + push).expand_as(before[0])
             state = torch.cat([*before, held], dim=-1)
             after = state @ each.mT if each.ndim == 2 else (each @ state.unsqueeze(-1)).squeeze(-1)
-            self._deviation, self._velocity = after.chunk(2, dim=-1)
+            self._command = after[..., : held.shape[-1]], after[..., held.shape[-1] :]
             if self._filter is not None:
-                self._filter.settle(before, (self._deviation, self._velocity), held)
+                self._filter.settle(before, self._command, held)
         self._move_on(tick, commanded)
         return record | {"stiffness": stiffness, "damping": damping}
 
     def _move_on(self, tick: int, commanded: Tensor) -> None:
         """Let the robot follow its command, and express all relative to the next tick's desired pose."""
         task = self._task
-        self._deviation = task.carry(tick, self._deviation)
+        self._command = task.carry(tick, self._command[0]), self._command[1]
         if self._follow is not None:
-            self._commands.append(commanded)
-            state = torch.stack([*self._robot, self._commands.pop(0)], dim=-1)
+            self._waiting.append(commanded)
+            state = torch.stack([*self._robot, self._waiting.pop(0)], dim=-1)
             away, speed = (state @ self._follow.mT).unbind(-1)
             self._robot = task.carry(tick, away), speed
-            self._commands = [task.carry(tick, each) for each in self._commands]
+            self._waiting = [task.carry(tick, each) for each in self._waiting]
         if self._filter is not None and task.transport is not None:
             self._filter.carry(task.transport[..., tick, :, :])
 
