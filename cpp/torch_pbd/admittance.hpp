@@ -72,8 +72,8 @@ public:
 
     explicit Admittance(const Schedule& schedule, const Options& options = {})
         : rate_(checked(options.rate, 0.0 < options.rate && options.rate < infinity, "rate", "above 0")),
-          max_step_(checked(options.max_step, 1.0 / rate_ < options.max_step && options.max_step < infinity, "max_step",
-                            "above 1 / rate, finite")),
+          longest_(checked(options.max_step, 1.0 / rate_ < options.max_step && options.max_step < infinity, "max_step",
+                           "above 1 / rate, finite") + kCoarse / rate_),
           max_bad_ticks_(options.max_bad_ticks),
           channel_(options.force_limit, options.deadband, options.force_rate_limit, options.hold_ticks),
           speed_limit_(checked<N, M>(options.velocity_limit, "velocity_limit", false, true)),
@@ -100,9 +100,8 @@ public:
 
     /// Begins, or begins again: faults, forces and motion are forgotten.
     void start(double now, const Start& from) {
-        // A reading must tell ticks apart to 1 %: times since 1970 in s do, in ns they do not.
         const double resolution = std::nextafter(std::abs(now), infinity) - std::abs(now);
-        checked(now, resolution * rate_ <= 0.01, "now", "small enough to tell ticks apart: give seconds");
+        checked(now, resolution * rate_ <= kCoarse, "now", "small enough to tell ticks apart: give seconds");
         checked(from.at, 0.0 <= from.at && from.at <= table_->end, "at", "a time of the schedule, in s");
         check_finite(from.position.value_or(Position{}), "position");
         check_finite(from.velocity, "velocity");
@@ -143,7 +142,7 @@ public:
     Faults tick(double now, const Vector<N>& force) noexcept {
         if (!is_started_) return kStopped;
         const double step = now - last_;
-        const bool is_regular = is_regular_ && 0.0 < step && step <= max_step_;
+        const bool is_regular = is_regular_ && 0.0 < step && step <= longest_;
         Faults faults = channel_.take(force, is_regular ? step : step_);
         is_stopped_ = is_stopped_ || channel_.is_lost;
         faults |= is_regular ? live(now, step) : live_irregular(now);
@@ -184,6 +183,8 @@ private:
     static constexpr Limit kDeceleration{5.0, 10.0};
     // Share of the newest tick in how long a tick lasts: neither one short tick nor one long counts for much.
     static constexpr double kSmoothing = 0.1;
+    // A reading must tell ticks apart to 1 %, which of their length is rounding: times since 1970 in s do, in ns not.
+    static constexpr double kCoarse = 0.01;
     static constexpr int kLateOnEnd = 3;  // one late tick is a stall, two may be; three are a loop that is too slow
     static constexpr double kOff = 1e-3;  // of a quaternion's length: four rounded digits
 
@@ -257,7 +258,7 @@ private:
         }
         newest_ = now;
         n_bad_ = 0;
-        if (now - last_ > max_step_) {
+        if (now - last_ > longest_) {
             ++n_late_;
             return kLate;
         }
@@ -278,7 +279,7 @@ private:
         last_ = now;
     }
 
-    double rate_, max_step_;
+    double rate_, longest_;  ///< tick
     int max_bad_ticks_;
     ForceChannel<N, M> channel_;
     Limit speed_limit_, acceleration_limit_;

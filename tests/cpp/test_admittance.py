@@ -164,6 +164,9 @@ def test_a_loop_that_is_too_slow_stops(tmp_path):
     both.start(0.0)
     assert both.cpp.tick(0.02, [1.0]) == both.cpp.tick(0.04, [1.0]) == TickStatus.LATE
     assert both.cpp.tick(0.06, [1.0]) == TickStatus.LATE | TickStatus.STOPPED
+    both = Both(make_schedule(1), tmp_path)
+    both.start(0.0)
+    assert not any(both.tick(0.01 * i, [1.0]) for i in range(1, 100))  # as long as may be, but for rounding
 
 
 def test_before_start_it_stands(tmp_path):

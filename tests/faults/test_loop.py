@@ -309,6 +309,14 @@ def test_79_a_loop_that_is_always_too_slow_is_refused_with_its_step():
     assert controller.position[0] > 0.0
 
 
+@pytest.mark.parametrize("origin", [0.0, 1234.567, 1_767_225_600.0])
+def test_79_ticks_of_max_step_are_not_late_however_they_are_rounded(origin):
+    controller = one_axis(max_step=0.01)
+    controller.start(origin)
+    assert not any(controller.tick(origin + 0.01 * i, [5.0]) for i in range(1, 100))
+    assert controller.tick(origin + 1.0001, [5.0]) == TickStatus.LATE
+
+
 def test_79_a_loop_that_has_become_too_slow_stops_the_robot():
     controller = RealTimeAdmittance(cut())
     controller.start(0.0, velocity=[SPEED])

@@ -223,7 +223,7 @@ class RealTimeAdmittance:
                 raise checks.refusal(now, "now", "a time in s") from None
             channel, motion = self._channel, self._motion
             step = now - motion.last
-            is_regular = motion.is_regular and 0.0 < step <= motion.max_step
+            is_regular = motion.is_regular and 0.0 < step <= motion.longest
             if not is_regular:
                 motion.check_start(now)
             status = channel.take(force, step if is_regular else motion.step)

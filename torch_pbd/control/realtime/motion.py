@@ -19,7 +19,8 @@ from torch_pbd.exceptions import InvalidParameterError
 
 # From an approach at 0.5 m/s and 1 rad/s a robot is at rest in 0.1 s, after 25 mm and 3 degrees.
 _DECELERATION = (5.0, 10.0)
-# Time readings must resolve ticks to 1 %: times since 1970 in s do, as floats in ns they do not.
+# Time readings must resolve ticks to 1 %: times since 1970 in s do, as floats in ns they do not. So much of a tick is
+# rounding of its length.
 _COARSE = 0.01
 # One late tick is a stall, and two may be; three consecutive ones mean that the loop is too slow.
 _LATE_ON_END = 3
@@ -32,7 +33,7 @@ _OFF = 1e-3  # tolerance of a quaternion's length, which admits four rounded dig
 class Motion:
     """Place and velocity of the command, their dynamics, and whether the robot brakes for good.
 
-    Ticks take at most ``max_step`` s; ``last`` is the time up to which the motion is known, ``step`` the mean tick.
+    Ticks take at most ``longest`` s; ``last`` is the time up to which the motion is known, ``step`` the mean tick.
     """
 
     row: Vector
@@ -50,7 +51,9 @@ class Motion:
         max_bad_ticks: int,
     ) -> None:
         self._table, self._clock = table, clock
-        self.max_step = checks.number(max_step, "max_step", above=1.0 / table.rate, unit="s", remedy="give some ticks")
+        above, remedy = 1.0 / table.rate, "give some ticks"
+        self._max_step = checks.number(max_step, "max_step", above=above, unit="s", remedy=remedy)
+        self.longest = self._max_step + _COARSE / table.rate
         self._max_bad_ticks = checks.count(max_bad_ticks, "max_bad_ticks")
         speeds, rises, stops = (options[name] for name in ("velocity_limit", "acceleration_limit", "stop_deceleration"))
         self._speed_limits, self._rises = speeds, rises
@@ -139,9 +142,9 @@ class Motion:
         if math.isnan(self.last):
             raise RuntimeError("tick before start: call start(now) with the time of the same clock first.")
         late, step = self._n_late + 1, now - self.last
-        if self._is_new and late >= _LATE_ON_END and self.max_step < step < math.inf:
+        if self._is_new and late >= _LATE_ON_END and self.longest < step < math.inf:
             must = f"longer than a tick: all {late} since start were longer, the last of {step:.4g} s"
-            raise checks.refusal(self.max_step, "max_step", must, "give some ticks, and times in s", unit="s")
+            raise checks.refusal(self._max_step, "max_step", must, "give some ticks, and times in s", unit="s")
 
     def live_irregular(self, now: float, push: Vector) -> int:
         """Advance as `live` by a tick that differs from the last one, or to an invalid time ``now``."""
@@ -170,7 +173,7 @@ class Motion:
             self._clock.shift(now - self.step - self.last)
             self.last = now - self.step
         self._newest, self._n_bad = now, 0
-        if now - self.last > self.max_step:
+        if now - self.last > self.longest:
             self._n_late += 1
             return TickStatus.LATE
         self.is_regular, self._is_new, self._n_late = True, False, 0
