@@ -317,6 +317,20 @@ def test_arrays_of_laboratories(tmp_path):
         load_demonstrations(tmp_path / "odd.npz", rate=1)
 
 
+def test_arrays_of_one_width_are_recordings_by_number_and_signals_by_name(tmp_path):
+    first, other = PATHS[0], PATHS[0] + 1.0
+    np.savez(tmp_path / "signals.npz", position=first, force=other)
+    with pytest.raises(
+        DataFormatError, match=r"recordings or signals of one: \[force \(5, 3\), position \(5, 3\)\]: call"
+    ):
+        load_demonstrations(tmp_path / "signals.npz", rate=RATE)
+    one = load_demonstrations(tmp_path / "signals.npz", rate=RATE, outputs="position")
+    assert one == Demonstrations([np.arange(5) / RATE], [first], names=[f"position_{i}" for i in range(3)])
+    for name, options in (("time", {}), ("stamp", {"time": "stamp"})):
+        np.savez(tmp_path / "runs.npz", demo_0=first, demo_1=other, **{name: TIMES[0]})
+        assert load_demonstrations(tmp_path / "runs.npz", **options) == Demonstrations(TIMES[0], [first, other])
+
+
 # ROS
 
 

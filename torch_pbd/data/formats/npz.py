@@ -65,30 +65,35 @@ def read_array_file(path: Path, wanted: Wanted) -> Arguments:
 
 
 def _read_other(arrays: Mapping[str, NDArray[Any]], wanted: Wanted) -> Arguments:
-    """Arrays by names that mean nothing to us: (K, T, d), or a recording (T, d) each, or columns of one recording."""
+    """Arrays by names that mean nothing to us: (K, T, d), or numbered recordings (T, d), or signals of one."""
     arrays = {name: array for name, array in arrays.items() if array.dtype.kind in "biuf" and 1 <= array.ndim <= 3}
     names = sorted(arrays, key=natural)
     deep = [arrays[name] for name in names if arrays[name].ndim == 3]
     flat = [name for name in names if arrays[name].ndim == 2]
+    others = {name: arrays[name] for name in names if name not in flat}
+    fits = len({arrays[name].shape[1] for name in flat}) == 1
+    alike = len({re.sub(r"\d+", "", name) for name in flat}) == 1
+    shapes = preview([f"{name} {arrays[name].shape}" for name in names])
     if deep:
         shape = deep[0].shape[:2]
         # A grid (T,) that all share, columns (K, T), signals (K, T, d).
         signals = {n: np.broadcast_to(a, shape) if a.shape == shape[1:] else a for n, a in arrays.items()}
         signals = {n: a for n, a in signals.items() if a.shape[:2] == shape}
         recordings = [{name: array[k] for name, array in signals.items()} for k in range(shape[0])]
-    elif flat == names and len({arrays[name].shape[1] for name in names}) == 1:
-        recordings = [{"y": arrays[name]} for name in names]
+    elif fits and alike and (flat == names or (len(flat) > 1 and others.keys() <= {wanted.time, "time", "t"})):
+        recordings = [{"y": arrays[name]} | others for name in flat]
     elif len({len(array) for array in arrays.values()}) == 1:
+        if fits and flat == names and not wanted.outputs:
+            what = f"its arrays may be recordings or signals of one: {shapes}"
+            wanted.refuse(f"{what}: call recordings demo_0, demo_1, ..., or say which signals by outputs=.", "outputs")
         recordings = [arrays]
     else:
-        shapes = preview([f"{name} {arrays[name].shape}" for name in names])
-        raise ValueError(
-            f"its arrays fit no layout, (K, T, d), or (T, d) each of equal d, or (T,): {shapes}. {LOADERS}"
-        )
-    columns: dict[str, tuple[str, ...]] = {name: (name,) for name in recordings[0]}
-    for name, array in recordings[0].items():
-        if array.ndim == 2:
-            columns[name] = tuple(f"{name}{'' if name == 'y' else '_'}{i}" for i in range(array.shape[1]))
+        layouts = "(K, T, d), or demo_0, demo_1, ... of (T, d), or (T, d) and (T,) of one T"
+        raise ValueError(f"its arrays fit no layout, {layouts}: {shapes}. {LOADERS}")
+    columns = {
+        name: tuple(f"{name}{'' if name == 'y' else '_'}{i}" for i in range(a.shape[1])) if a.ndim == 2 else (name,)
+        for name, a in recordings[0].items()
+    }
     time = next((name for name in ("time", "t") if columns.get(name) == (name,)), "time")
     try:
         return wanted.read_each(wanted.choose(columns, time=time), recordings)
