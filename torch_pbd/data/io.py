@@ -3,7 +3,8 @@
 import inspect
 import os
 import warnings
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
@@ -12,7 +13,7 @@ from torch_pbd import checks
 from torch_pbd.data.demonstrations import Demonstrations
 from torch_pbd.data.description import Description, describe
 from torch_pbd.data.recordings import Missing
-from torch_pbd.data.wanted import MAX_BYTES, OPTIONS, Wanted, check_options, natural
+from torch_pbd.data.wanted import MAX_BYTES, OPTIONS, Arguments, Wanted, check_options, natural
 from torch_pbd.exceptions import DataFormatError
 from torch_pbd.files import LOADERS, replacing
 from torch_pbd.files.memory import require_memory
@@ -147,25 +148,33 @@ def find_files(source: Source) -> list[Path]:
 
 
 def _load(source: Source, wanted: Wanted, options: dict[str, Any]) -> Demonstrations:
-    files = [_load_file(file, wanted, options) for file in find_files(source)]
-    contents = wanted.since_first([next(file) for file in files])
-    return wanted.finish([file.send(content) for file, content in zip(files, contents, strict=True)])
+    files, parts = find_files(source), []
+    contents = wanted.since_first([_read(file, wanted, options) for file in files])
+    for file, content in zip(files, contents, strict=True):
+        with _named(file):
+            parts.append(Demonstrations(**content))
+    return wanted.finish(parts)
 
 
-def _load_file(file: Path, wanted: Wanted, options: dict[str, Any]) -> Generator[Any, Any, None]:
-    """Content of a file, and then, sent back with times that count from the first of all files, its demonstrations."""
+def _read(file: Path, wanted: Wanted, options: dict[str, Any]) -> Arguments:
     reader = _function(file, _reader_of(file), _FORMATS)
     own = list(inspect.signature(reader).parameters)[2:]
     check_options(options, [*OPTIONS, *own], f"{file.suffix or file.name} files")
     if not file.exists():
         raise FileNotFoundError(f"{file} does not exist, or is not a file.")
     n_bytes = file.stat().st_size
-    try:
+    with _named(file):
         if file.is_file() and n_bytes > wanted.max_bytes:
             raise ValueError(f"it has {n_bytes} bytes, more than max_bytes={wanted.max_bytes}: raise it to read this.")
         require_memory(_COPIES * n_bytes, what="reading it", remedy="Split the file, or leave samples out.")
-        content = yield reader(file, wanted, **options)
-        yield Demonstrations(**content)
+        return reader(file, wanted, **options)
+
+
+@contextmanager
+def _named(file: Path) -> Iterator[None]:
+    """What goes wrong with the contents of a file is a DataFormatError that names it."""
+    try:
+        yield
     except ModuleNotFoundError:
         raise
     except Exception as error:  # parsers of bytes that are not what they claim to be raise errors of all kinds
