@@ -127,7 +127,7 @@ def _of_ends(demonstrations: Any, recordings: list[dict[str, Any]]) -> Iterator[
 
 
 def _of_outputs(demonstrations: Any, outputs: list[dict[str, Any]], notes: Mapping[str, str]) -> Iterator[str]:
-    for place in quaternions(demonstrations.positions, demonstrations.n_outputs):
+    for place in quaternions(demonstrations.positions):
         name = f"Quaternion {', '.join(demonstrations.names[place : place + 4])}"
         each = [position[:, place : place + 4] for position in demonstrations.positions]
         flips = [k for k, q in enumerate(each) if ((q[1:] * q[:-1]).sum(axis=1) < 0.0).any() or q[0] @ each[0][0] < 0.0]

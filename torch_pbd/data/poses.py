@@ -145,7 +145,7 @@ def _check_reach(times: Sequence[Floats], turns: Sequence[Floats]) -> None:
 def find_suspects(positions: Sequence[Floats], names: Sequence[str], units: Sequence[str] | None) -> tuple[str, ...]:
     """Warnings about non-Euclidean outputs, with remedies; without units, an angle may be in rad or deg."""
     found = []
-    for first in quaternions(positions, len(names)):
+    for first in quaternions(positions):
         four = names[first : first + 4]
         order = tuple(sorted(four, key=lambda name: name[-1:]))
         known = [name[-1:] for name in order] == [*"wxyz"]
@@ -160,22 +160,18 @@ def find_suspects(positions: Sequence[Floats], names: Sequence[str], units: Sequ
     return tuple(found)
 
 
-def quaternions(positions: Sequence[Floats], n_outputs: int) -> list[int]:
+def quaternions(positions: Sequence[Floats]) -> list[int]:
     """Indices of outputs that begin four columns of unit quaternions."""
     found, first = [], 0
-    while first + 4 <= n_outputs:
-        columns = [_column(positions, i) for i in range(first, first + 4)]
-        off = np.abs(sum(map(np.square, columns)) - 1.0)
-        spread = max(map(np.ptp, columns))
+    together = np.concatenate(positions).clip(-_LARGEST_ANGLE, _LARGEST_ANGLE)
+    while first + 4 <= together.shape[1]:
+        four = together[:, first : first + 4]
+        off = np.abs(np.square(four).sum(axis=1) - 1.0)
+        spread = np.ptp(four, axis=0).max()
         if spread > 0.0 and np.mean(off <= min(_OFF_SPHERE, _OFF_SPHERE_SHARE * spread)) >= _SAMPLES_ON_SPHERE:
             found.append(first)
         first += 4 if first in found else 1
     return found
-
-
-def _column(positions: Sequence[Floats], i: int) -> Floats:
-    """One output of all demonstrations, clipped so that differences do not overflow."""
-    return np.concatenate([position[:, i] for position in positions]).clip(-_LARGEST_ANGLE, _LARGEST_ANGLE)
 
 
 def _wrapped(positions: Sequence[Floats], i: int, unit: str | None) -> str | None:
@@ -186,8 +182,8 @@ def _wrapped(positions: Sequence[Floats], i: int, unit: str | None) -> str | Non
         # Most outputs cover less than a turn, and are not looked at step by step.
         if whole < (1.0 - _QUARTER) * turn or (unit is None and whole > 1.01 * turn):
             continue
-        ends = np.cumsum([len(position) for position in positions])[:-1] - 1  # between two demonstrations
-        step = np.delete(np.abs(np.diff(_column(positions, i))), ends)
+        curves = [position[:, i].clip(-_LARGEST_ANGLE, _LARGEST_ANGLE) for position in positions]
+        step = np.abs(np.concatenate(list(map(np.diff, curves))))
         jumps = np.abs(step - turn) <= _QUARTER * turn
         other = step[~jumps].max(initial=0.0)
         # An unwrapped signal continues after the jump as smoothly as elsewhere.
