@@ -91,10 +91,7 @@ def correlation(
 def value_and_slope(
     square_differences: Float[Tensor, "e n m"], inverse_square: Float[Tensor, "b e"], kernel: str
 ) -> tuple[Float[Tensor, "b n m"], Float[Tensor, "b n m"]]:
-    """Correlation and its derivative by the squared distance in length scales, for b sets of length scales.
-
-    Both from squares of differences in each dimension and the inverse squares of the length scales.
-    """
+    """Correlation and its derivative by the squared distance in length scales, for b sets of length scales."""
     square_distance = (inverse_square @ square_differences.flatten(1)).reshape(-1, *square_differences.shape[1:])
     square_distance = square_distance.clamp_max(_FARTHEST)
     value = KERNELS[kernel].value(square_distance)

@@ -184,9 +184,6 @@ def refine(
     The likelihood alone is unbounded: a component may shrink onto a point. So covariances are
     A A^T + reg_covar I with A free: the floor that EM keeps, but maximized with, not added afterwards. Means
     and A are measured in the components' frames at the start, where the problem is nearly isotropic.
-
-    The arguments are those of :func:`expectation_maximization`, whose loss this lowers (``reg_covar`` above zero), and
-    of :func:`~torch_pbd.optim.minimize`.
     """
     with torch.no_grad():
         start = mixture.components()

@@ -20,7 +20,6 @@ from torch import Tensor
 from torch_pbd.linalg import scale_tril_from_root
 from torch_pbd.models.heteroscedastic.log_variance import squares_within
 from torch_pbd.models.heteroscedastic.posterior import LatentCovariance, LatentMean
-from torch_pbd.models.heteroscedastic.processes import ProcessFamily
 from torch_pbd.models.heteroscedastic.regression import NoiseCorrelation
 from torch_pbd.models.heteroscedastic.residuals import (
     LAGS,
@@ -81,12 +80,7 @@ class HeteroscedasticFit:
         self.n_demos = 1 if self.group is None else int(self.group.max()) + 1
         self._quantum = quantum(self.training.y)
         self._mean_search = Search(self.families.mean, self._n_outputs, self.options)
-        self._begin_covariance(self.families.log_variance)
-
-    def _begin_covariance(self, log_variance: ProcessFamily) -> None:
-        """Begin the searches of the covariance anew, on processes of a family."""
-        self.families = self.families._replace(log_variance=log_variance)
-        self.search = CovarianceSearch(self.families, self._n_outputs, self.options)
+        self.search = CovarianceSearch(self.families.log_variance, self._n_outputs, self.options)
 
     def fit_mean(self, anew: TrainingSet | None) -> None:
         """Mean under the noise so far, and residuals; begun again of rows ``anew`` if it does not follow the data."""
@@ -139,12 +133,12 @@ class HeteroscedasticFit:
         """Stretch the ends where the covariance collapses; and begin its searches anew if what the first turn took for
         independent is not, or has other features: that is no place to start from.
         """
-        before = self.families.log_variance
+        before = self.search.log_variance.family
         squares = squares_within(self.training, self.normal(), noise)
         after = stretched(before, self.training.inputs, squares, self.options)
         if after is not before or noise is not None:
             self.covariance = None
-            self._begin_covariance(after)
+            self.search = CovarianceSearch(after, self._n_outputs, self.options)
 
     def refine(self) -> bool:
         """Go on with more inducing inputs where these do not resolve what was found; whether there is need to."""
@@ -155,8 +149,9 @@ class HeteroscedasticFit:
             self._mean_search = Search(self.larger.mean, self._n_outputs, self.options)
         coarse = not (self.covariance.log_variances.resolved and self.covariance.rows.resolved)
         if coarse:
-            stretch = self.families.log_variance.stretch
-            self._begin_covariance(on_stretched_inputs(self.larger.log_variance, self.training.inputs, stretch))
+            stretch = self.search.log_variance.family.stretch
+            family = on_stretched_inputs(self.larger.log_variance, self.training.inputs, stretch)
+            self.search = CovarianceSearch(family, self._n_outputs, self.options)
         self.larger = None if coarse or coarse_mean else self.larger
         return coarse or coarse_mean
 

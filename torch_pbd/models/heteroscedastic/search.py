@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import product
 from operator import itemgetter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -26,7 +26,7 @@ from torch_pbd.optim.batch import FitReport, Progress, Status, first_failure, gu
 # are of outputs with unit variance, log variances and coefficients of residuals with a pooled unit covariance.
 _MEAN = (0.3, 1.2, 0.0)
 _LOG_VARIANCE = (0.5, 1.0, 2.0)
-_COEFFICIENT = (0.5, 0.3, 1.0)
+COEFFICIENT: dict[str, Any] = {"length_scale": 0.5, "amplitude": 0.3, "constant": 1.0}
 
 # By default, for one column of X and for several, and where these do not resolve what is learned. At most of all
 # outputs together, for the mean and for the covariance, as a fit takes the cube of these; but a dozen for each output.
@@ -52,12 +52,6 @@ class Families(NamedTuple):
 
     mean: ProcessFamily
     log_variance: ProcessFamily
-
-    @property
-    def coefficients(self) -> ProcessFamily:
-        """Family of the coefficients of the factor, on the features of the log variances."""
-        length_scale, amplitude, constant = _COEFFICIENT
-        return replace(self.log_variance, length_scale=length_scale, amplitude=amplitude, constant=constant)
 
 
 def inducing_sizes(n_inducing: int | None, n_features: int, n_outputs: int) -> list[tuple[int, int]]:

@@ -19,7 +19,7 @@ from torch_pbd.gp.search import fit_together
 from torch_pbd.linalg import triangular_inverse
 from torch_pbd.models.heteroscedastic.log_variance import LEAST_SQUARE, Squares, fit_log_variance, log_variance_evidence
 from torch_pbd.models.heteroscedastic.posterior import LatentCovariance, LatentMean
-from torch_pbd.models.heteroscedastic.processes import CLEAR, FixedFeatures, Gradient, inducing_inputs
+from torch_pbd.models.heteroscedastic.processes import CLEAR, FixedFeatures, Gradient, ProcessFamily, inducing_inputs
 from torch_pbd.models.heteroscedastic.regression import (
     LinearEvidence,
     MixedResponses,
@@ -29,7 +29,7 @@ from torch_pbd.models.heteroscedastic.regression import (
     whiten,
     whiten_vjp,
 )
-from torch_pbd.models.heteroscedastic.search import Families, Search, SearchOptions
+from torch_pbd.models.heteroscedastic.search import COEFFICIENT, Search, SearchOptions
 from torch_pbd.models.training import TrainingSet, pooled_tril
 
 MOST_INPUTS = 1024
@@ -122,11 +122,14 @@ def mean_start(
 
 
 class CovarianceSearch:
-    """Searches of the hyperparameters of the log variances, and of the coefficients of outputs 1, 2, ..., if any."""
+    """Searches of the hyperparameters of the log variances, and of the coefficients of outputs 1, 2, ..., if any.
 
-    def __init__(self, families: Families, n_outputs: int, options: SearchOptions) -> None:
-        self.log_variance = Search(families.log_variance, n_outputs, options)
-        self.coefficient_family = families.coefficients
+    These are on the features of the log variances.
+    """
+
+    def __init__(self, log_variance: ProcessFamily, n_outputs: int, options: SearchOptions) -> None:
+        self.log_variance = Search(log_variance, n_outputs, options)
+        self.coefficient_family = replace(log_variance, **COEFFICIENT)
         self.coefficients = [Search(self.coefficient_family, 1, options) for _ in range(1, n_outputs)]
 
 
