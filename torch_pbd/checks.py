@@ -121,14 +121,14 @@ def text(value: Any, name: str, *, optional: bool = False) -> Any:
     return value
 
 
-def seed(value: Any, name: str = "random_state") -> np.random.RandomState:
+def seed(value: Any) -> np.random.RandomState:
     """RandomState of a seed, as scikit-learn makes it; None is NumPy's global one."""
     from sklearn.utils import check_random_state  # a second to import, which schedules and the loop need not spend
 
     if not isinstance(value, bool):
         with suppress(ValueError):
             return check_random_state(value)
-    raise refusal(value, name, "None, an integer from 0 to 2**32 - 1 or a numpy.random.RandomState")
+    raise refusal(value, "random_state", "None, an integer from 0 to 2**32 - 1 or a numpy.random.RandomState")
 
 
 def array(values: Any, name: str, shape: Sequence[int | str] | None) -> Floats:

@@ -207,16 +207,15 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
 def _warn_of_residuals(fit: HeteroscedasticFit, given: torch.Tensor) -> None:
     """Warn if rows ``given`` in this order without groups look like demonstrations, or the mean misses a signal."""
     if fit.group is None and are_copies(fit.whitened(), fit.training, given):
-        message = (
+        checks.warn(
             "y has rows that nearly repeat those beside them along X, as samples of a demonstration do. Without groups "
             "they count as independent, and what is predicted is far too certain. Give groups, the demonstration of "
             "each row, to fit; cross_val_score takes params={'groups': groups}, and a search passes them on where "
-            "metadata routing is enabled and set_fit_request(groups=True) asks for them."
+            "metadata routing is enabled and set_fit_request(groups=True) asks for them.",
+            DataRankWarning,
         )
-        checks.warn(message, DataRankWarning)
     elif bool((missed := fit.missed()).any()):
-        message = (
+        checks.warn(
             f"The mean does not follow y in outputs {missed.nonzero().flatten().tolist()}: what is left is no noise, "
             "but counts as such. Raise n_inducing and max_inputs; give groups if the rows are of demonstrations."
         )
-        checks.warn(message)

@@ -56,11 +56,9 @@ def _check_numbers(array: NDArray[Any], name: str) -> None:
     if array.dtype in (np.float16, np.float32):
         step, spread = np.finfo(array.dtype).eps * np.abs(floats).max(axis=0), np.ptp(floats, axis=0)
         fine = np.asarray((step <= 1e-3 * spread) | (spread == 0))
-        must, remedy = (
-            "at most a thousandth of its range",
-            "subtract an offset before storing it, or record it in float64",
-        )
-        checks.require(fine, np.asarray(step), f"the resolution of {array.dtype} in {name}", must, remedy)
+        what, must = f"the resolution of {array.dtype} in {name}", "at most a thousandth of its range"
+        remedy = "subtract an offset before storing it, or record it in float64"
+        checks.require(fine, np.asarray(step), what, must, remedy)
 
 
 def checked_rows(estimator: Any, X: ArrayLike, y: ArrayLike | None, **options: Any) -> tuple[Floats, Floats]:

@@ -261,10 +261,9 @@ def _backtrack(objective: ValueAndGradient, at: _Problems) -> tuple[Tensor, Tens
         value, its_gradient = objective(trial, at.rows[left])
         finite = torch.isfinite(value + its_gradient.sum(-1))
         accepted = finite & (value <= before - _ARMIJO * (share * slope))
-        x, loss, gradient = (
-            old.index_copy(0, left[accepted], new[accepted])
-            for old, new in ((x, trial), (loss, value), (gradient, its_gradient))
-        )
+        x = x.index_copy(0, left[accepted], trial[accepted])
+        loss = loss.index_copy(0, left[accepted], value[accepted])
+        gradient = gradient.index_copy(0, left[accepted], its_gradient[accepted])
         if bool(accepted.all()):
             return x, loss, gradient, blocked
         # The minimum of the parabola through both values and the slope, kept within a tenth and a half.

@@ -124,5 +124,4 @@ def _bias(franky: Any, model: Any, state: Any) -> Floats:
         model.zero_jacobian(franky.Frame.EndEffector, state.q + step * state.dq, state.F_T_EE, state.EE_T_K)
         for step in (_STEP, -_STEP)
     )
-    change: Floats = (ahead - behind) @ state.dq / (2.0 * _STEP)
-    return change
+    return np.asarray((ahead - behind) @ state.dq / (2.0 * _STEP))

@@ -61,8 +61,7 @@ class MujocoArm:
         """Acceleration (6,) of the tool in a simulation at constant joint speeds."""
         rate = np.empty((6, self._model.nv))
         self._library.mj_jacDot(self._model, data, rate[:3], rate[3:], self._frame(data).xpos, self._body)
-        change: Floats = rate @ data.qvel
-        return change
+        return np.asarray(rate @ data.qvel)
 
     def measure(self, data: Any) -> ToolState:
         """State of the tool in a simulation whose positions are up to date."""
