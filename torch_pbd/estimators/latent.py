@@ -19,6 +19,7 @@ from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.files.memory import require_much
 from torch_pbd.gp.evidence import EvidenceSearch
 from torch_pbd.gp.observations import (
+    SHORTEST,
     Hyperparameters,
     LatentGP,
     Observations,
@@ -37,8 +38,7 @@ from torch_pbd.optim.batch import FitReport
 
 # A process is stretched if its amplitude exceeds its values by this factor; where it can follow them it is up to 2.
 _STRETCHED = 10.0
-# Shortest length scale of an interpolating process in spacings of the inputs, and longest of a mean in their ranges.
-_SHORTEST, _LONGEST_MEAN = 0.75, 10.0
+_LONGEST_MEAN = 10.0  # length scale of a mean, in ranges of the inputs
 
 _LEVEL = 1e-4  # significance level of the lack-of-fit tests: how often a right mean is rejected
 _CLEAR = 5.0  # standard errors that always reject a mean: with two rows at two inputs the t test would allow 100
@@ -194,7 +194,7 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         shortest = resolved_length_scale(inputs)
         if noise_scale is not None and not bool((noise_scale > 0).any()):
             # A longer length scale than where inputs are closest makes an interpolating process swing between others.
-            shortest = min(0.5, max(1e-6, _SHORTEST * spacing(inputs, 0.1)))
+            shortest = min(0.5, max(1e-6, SHORTEST * spacing(inputs, 0.1)))
         limits = self.max_inputs, self.n_restarts, max(100, self.max_iter)
         return EvidenceSearch(self.kernel, (shortest, longest), length_scale, noise_scale, *limits)
 

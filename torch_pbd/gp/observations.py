@@ -15,7 +15,9 @@ from torch_pbd.linalg import cholesky_with_jitter, safe_cholesky
 # each node nothing is gained by them.
 _N_NODES, _WORTH = (32, 48, 88, 168), 1.5
 
-_SHORTEST = 0.75  # spacings of the inputs: shorter "needles" explain each point by itself
+SHORTEST = 0.75
+"""Length scale in spacings of the inputs, below which "needles" explain each point by itself."""
+
 _LONGEST = 0.35  # largest length scale as a share of the range: with longer ones a covariance never reached its prior
 # A hole is so much of the range, and so many spacings of the other inputs. It is to hold so many length scales: a
 # smooth process without noise claims to know what is two to three of them from many inputs.
@@ -45,7 +47,7 @@ def resolved_length_scale(inputs: Float[Tensor, "n e"]) -> float:
     """Shortest length scale that the inputs, of a range of about one, tell from noise."""
     n_inputs, n_features = inputs.shape
     detail = max(spacing(inputs), n_inputs ** (-1.0 / n_features))
-    return min(0.5, max(1e-6, _SHORTEST * detail))  # inputs may coincide but for rounding
+    return min(0.5, max(1e-6, SHORTEST * detail))  # inputs may coincide but for rounding
 
 
 def spacing(inputs: Float[Tensor, "n e"], quantile: float = 0.9) -> float:

@@ -86,7 +86,7 @@ class HeteroscedasticFit:
         """Mean under the noise so far, and residuals; begun again of rows ``anew`` if it does not follow the data."""
         noise = self.noise_correlation(self.mean_rows, squares=False)
         self.mean = fit_mean(self._mean_search, self.mean_rows, self.noise_tril(self.mean_rows.inputs), noise)
-        self.residual = self.training.y - self.mean.expected_at_all(self.training)
+        self.residual = self.mean.residual(self.training)
         if anew is None or self._follows():
             return
         if (start := mean_start(anew, self.mean, self.pooled_tril, self.options)) is not None:

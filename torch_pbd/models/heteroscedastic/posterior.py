@@ -28,7 +28,6 @@ from torch_pbd.models.heteroscedastic.processes import Processes
 from torch_pbd.models.heteroscedastic.regression import Weights
 from torch_pbd.models.training import TrainingSet
 
-_CHUNK = 1024  # rows at a time: bounds the memory
 _LEAST_DEGREES = 3.0  # below two, Student's t has no covariance
 # Longest length scale by which distance from the data is judged, in ranges of the input times the number of inputs;
 # but two spacings of the inducing inputs at least.
@@ -60,16 +59,16 @@ class LatentMean:
     def _expected(self, features: Tensor) -> Float[Tensor, "n d"]:
         return (features @ self.weights.mean.reshape(len(features), -1, 1)).squeeze(-1).mT
 
-    def expected_at_all(self, training: TrainingSet) -> Float[Tensor, "rows d"]:
-        """Expected mean of all rows; where they do not repeat inputs a bounded number at a time."""
+    def residual(self, training: TrainingSet) -> Float[Tensor, "rows d"]:
+        """Residual of y from the expected mean at each row."""
         if training.repeats_inputs:
-            return self.expected_at(training.inputs)[training.index]
+            return training.residual(self.expected_at)
         processes = self.processes
         weights = processes.amplitude[:, None] * self.weights.mean.reshape(len(processes.theta), -1)
         # Weights of the kernel with the inducing inputs, from those of the features: no equations are solved for
         # each row.
         weights = torch.linalg.solve_triangular(processes.factor.mT, weights.unsqueeze(-1), upper=True)
-        return torch.cat([(processes.cross(part) @ weights).squeeze(-1).mT for part in training.x.split(_CHUNK)])
+        return training.residual(lambda x: (processes.cross(x) @ weights).squeeze(-1).mT)
 
 
 @dataclass(frozen=True)

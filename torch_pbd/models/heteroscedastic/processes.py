@@ -15,13 +15,12 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from torch_pbd.gp.observations import neighbourhoods, spacing, sum_by
+from torch_pbd.gp.observations import SHORTEST, neighbourhoods, spacing, sum_by
 from torch_pbd.kernels import correlation, differences, value_and_slope
 from torch_pbd.linalg import safe_cholesky
 
 # In ranges of the inputs: those that nearly coincide, as of two precisions, show no finer detail than this.
 _SHORTEST = 1e-3
-_EXACT_RESOLUTION = 0.75  # spacings of the inputs: shorter "needles" explain each input by itself
 _RESOLUTION = 1.0  # spacings: at this length scale features carry 0.995 of the variance between inducing inputs
 CLEAR = 3.0  # times the shortest length scale, above which inducing inputs resolve one with room to spare
 # Of a process's variance: less than this that features do not carry is the jitter of kernel matrices, and rounding.
@@ -105,7 +104,7 @@ class ProcessFamily:
         """Length scale below which the inducing inputs no longer resolve what is between them."""
         if len(self.inducing) < 2:
             return _SHORTEST
-        share = _EXACT_RESOLUTION if self.exact else _RESOLUTION
+        share = SHORTEST if self.exact else _RESOLUTION
         return max(_SHORTEST, min(0.5, share * spacing(self.warped(self.inducing))))
 
     def length_scale_of(self, theta: Float[Tensor, "b q"]) -> Float[Tensor, "b e"]:
