@@ -64,18 +64,23 @@ class HeteroscedasticFit:
     families: Families
     larger: Families | None
     options: SearchOptions
-    mean_rows: TrainingSet
-    pooled_tril: Float[Tensor, "d d"]
-    """C, once there are residuals."""
     covariance: LatentCovariance | None = None
     """Posterior of L, the factor of the residuals' covariance once they are multiplied by the inverse of C."""
     correlation: DemonstrationCorrelation | None = None
     log_evidence: list[float] = field(default_factory=list)
     """Log evidence of the covariance's processes at the end of each turn, in nats."""
+    mean_rows: TrainingSet = field(init=False)
+    pooled_tril: Float[Tensor, "d d"] = field(init=False)
+    """C, once there are residuals; before, the factor of the covariance within inputs or neighbourhoods."""
     mean: LatentMean = field(init=False)
     residual: Float[Tensor, "rows d"] = field(init=False)
 
     def __post_init__(self) -> None:
+        self.mean_rows = whole = self.training
+        if len(whole.x) < 2 * len(whole.inputs):  # they do not repeat
+            whole = whole.merged(max(2, len(whole.x) // _ROWS_TOGETHER))
+        # A thousandth of y's deviation: noise is never less where the search for the mean begins.
+        self.pooled_tril = scale_tril_from_root(pooled_tril(whole), 1e-3)
         self._n_outputs = self.training.y.shape[1]
         self.n_demos = 1 if self.group is None else int(self.group.max()) + 1
         self._quantum = quantum(self.training.y)
@@ -211,7 +216,7 @@ def fit_heteroscedastic(
     last. Of ``rows``, at all their inputs, the mean begins anew where the first one does not follow the data.
     """
     larger = to_try[1] if len(to_try) > 1 else None
-    fit = HeteroscedasticFit(training, group, to_try[0], larger, options, training, _start_tril(training))
+    fit = HeteroscedasticFit(training, group, to_try[0], larger, options)
     # Share of the rows that count before the correlation of a demonstration's samples is known.
     first_part = 1.0 if group is None else min(1.0, _FIRST_SAMPLES * fit.n_demos / len(group))
     started, turn, n_turns = time.perf_counter(), 0, _TURNS
@@ -244,11 +249,3 @@ def fit_heteroscedastic(
             fit.correlate()
         turn += 1
     return fit
-
-
-def _start_tril(training: TrainingSet) -> Tensor:
-    """Factor of the covariance within inputs, or within neighbourhoods where they do not repeat."""
-    repeated = 2 * len(training.inputs) <= len(training.x)
-    whole = training if repeated else training.merged(max(2, len(training.x) // _ROWS_TOGETHER))
-    # A thousandth of y's deviation: noise is never less where the search for the mean begins.
-    return scale_tril_from_root(pooled_tril(whole), 1e-3)

@@ -4,7 +4,7 @@ Also where the mean begins if a first one does not follow the data: at what the 
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -25,7 +25,6 @@ from torch_pbd.models.heteroscedastic.regression import (
     MixedResponses,
     NoiseCorrelation,
     Regression,
-    Weights,
     whiten,
     whiten_vjp,
 )
@@ -164,8 +163,9 @@ def fit_covariance(
     near, following = None, whole
     if previous is not None:
         near = previous.log_variance_at(inputs)[0].mT
-        known = partial(_known_row, previous.coefficients, previous.rows(inputs))
-        _, following, _ = _regress(scatter, whole, near, torch.exp(-near), known)
+        rows = zip(previous.rows(inputs), previous.coefficients, strict=True)
+        known = [(features, mean, root @ root.mT, 0.0) for features, (mean, root) in rows]
+        _, following, _ = _regress(scatter, whole, near, torch.exp(-near), lambda i, _: known[i - 1])
     for sweep in range(_SWEEPS if scatter.shape[1] > 1 and not cautious else 1):
         squares = following
         near = (squares.log_pooled if near is None else near).clone()
@@ -182,10 +182,10 @@ def fit_covariance(
     log_variances = search.log_variance.family.prepared(theta)
     weights = fit_log_variance(squares, log_variances(inputs), log_variance.location).posterior.weights
     thetas = [each.theta for each in search.coefficients if each.theta is not None]
-    rows = search.coefficient_family.prepared(torch.cat([theta[:0], *thetas]))
-    of_regressions = zip(regressions, rows(inputs).unsqueeze(1), strict=True)
+    processes = search.coefficient_family.prepared(torch.cat([theta[:0], *thetas]))
+    of_regressions = zip(regressions, processes(inputs).unsqueeze(1), strict=True)
     coefficients = [regression.weights(features) for regression, features in of_regressions]
-    return LatentCovariance(log_variances, weights, rows, coefficients), evidence
+    return LatentCovariance(log_variances, weights, processes, coefficients), evidence
 
 
 def _regress(
@@ -217,13 +217,6 @@ def _regress(
         row = torch.cat([features @ mean.reshape(i, -1).mT, deviation[i][:, None]], dim=1)
         tril = torch.cat([pad(tril, (0, 1)), row.unsqueeze(1)], dim=1)
     return regressions, Squares(torch.stack(totals), torch.stack(degrees), noise), divergence
-
-
-def _known_row(
-    coefficients: Sequence[Weights], features: Tensor, i: int, _: Regression
-) -> tuple[Tensor, Tensor, Tensor, float]:
-    mean, root = coefficients[i - 1]
-    return features[i - 1], mean, root @ root.mT, 0.0
 
 
 def _searched_row(
