@@ -56,6 +56,13 @@ def test_an_arms_inertia_is_refused_and_what_is_lost_is_told():
         to_actions(stiff.with_inertia(1.0))
 
 
+def test_damping_beyond_the_controllers_limits_is_refused():
+    schedule = diagonal_schedule(np.array([0.4, 0.0, 0.5]), np.array([0.0, 1.0, 0.0, 0.0]))
+    assert to_actions(schedule.with_inertia(1.0, damping_ratio=10.0))[:, :6].max() == pytest.approx(10.0)
+    with pytest.raises(ValueError, match=r"damping_ratio\[0, 0\] is 12\..*, must be at most 10: give"):
+        to_actions(schedule.with_inertia(1.0, damping_ratio=12.0))
+
+
 def test_in_robosuite_the_arm_is_on_its_way():
     """Of the real library: 2 mm at 20 Hz, at which goals stand still for 50 ms."""
     robosuite = pytest.importorskip("robosuite")

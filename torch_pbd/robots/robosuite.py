@@ -24,7 +24,7 @@ CONTROLLER: dict[str, Any] = {
 }
 """Settings of an arm's controller that `to_actions` is for: ``controller_configs["body_parts"]["right"]``."""
 
-# Limits of the motion alone; gains are checked against those of kp, which robosuite clips silently.
+# Limits of the motion alone; gains are checked against those of CONTROLLER, to which robosuite clips silently.
 _LIMITS = RobotLimits(stiffness=(0.0, np.inf), rotational_stiffness=(0.0, np.inf))
 
 
@@ -67,6 +67,11 @@ def to_actions(schedule: Schedule, control_freq: float = 20.0) -> Floats:
     stiffness, damping = (np.diagonal(gain, axis1=1, axis2=2) / mass for gain in (rows.stiffness, rows.damping))
     good = (stiffness > 0.0) & (stiffness <= CONTROLLER["kp_limits"][1])
     checks.require(good, stiffness, "kp", "above zero and at most 3000 1/s^2", "learn with a smaller stiffness_max")
+    ratio, most = 0.5 * damping / np.sqrt(stiffness), CONTROLLER["damping_ratio_limits"][1]
+    good = ratio <= most * (1.0 + checks.ROUNDING)
+    checks.require(
+        good, ratio, "damping_ratio", f"at most {most}", "give schedule.with_inertia(1.0, damping_ratio=1.0)"
+    )
     ahead = (damping * rows.velocity + accelerations(rows)) / stiffness
     turned = rotations.log(rotations.multiply(rotations.exp(ahead[:, 3:]), orientation))
-    return np.hstack([0.5 * damping / np.sqrt(stiffness), stiffness, position + ahead[:, :3], turned])
+    return np.hstack([ratio, stiffness, position + ahead[:, :3], turned])
