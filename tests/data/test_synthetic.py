@@ -145,9 +145,9 @@ def test_common_start_has_no_spread_but_the_tremor():
 
 @pytest.mark.parametrize("ends", [{}, {"common_goal": True}, {"common_start": True, "common_goal": True}])
 def test_the_deviation_is_that_of_many_demonstrations(ends):
-    demonstrations = make_tunnel_demonstrations(3000, rate=10.0, random_state=0, **ends).to_array()
+    demonstrations = make_tunnel_demonstrations(2000, rate=10.0, random_state=0, **ends).to_array()
     found, at = demonstrations[:, :, 0].std(axis=0), demonstrations[0, :, 1].clip(0.0, 0.6)
-    np.testing.assert_allclose(found, tunnel_deviation(at, **ends), rtol=0.06)  # standard error 1.3 %, 101 steps
+    np.testing.assert_allclose(found, tunnel_deviation(at, **ends), rtol=0.06)  # standard error 1.6 %, 101 steps
 
 
 def test_a_common_goal_has_no_spread_but_the_tremor():

@@ -478,13 +478,13 @@ def largest_tensor(work):
 
 
 @pytest.mark.filterwarnings("ignore:y has 6 demonstrations")
-@pytest.mark.parametrize("n", [400, pytest.param(1000, marks=pytest.mark.slow)])
-def test_many_steps_of_fourteen_outputs_need_no_matrix_of_all(n):
+@pytest.mark.parametrize(("n", "every"), [(400, 10), pytest.param(1000, 1, marks=pytest.mark.slow)])
+def test_many_steps_of_fourteen_outputs_need_no_matrix_of_all(n, every):
     rng = np.random.default_rng(0)
     grid, n_demos, d = np.linspace(0.0, 1.0, n), 6, 14
     phases = rng.normal(size=(n_demos, 1, d)) * 0.1
     demos = np.sin(2.0 * np.pi * (grid[:, np.newaxis] + phases)) + 0.1 * rng.normal(size=(n_demos, 1, d))
-    X, y, groups = stacked(demos, grid)
+    X, y, groups = stacked(demos[:, ::every], grid[::every])  # what is asked of many steps may be learned from few
     model = TrajectoryRegressor(GMMBaseline(n_components=3, n_restarts=0)).fit(X, y, groups=groups)
     at = grid[:, np.newaxis]
 
