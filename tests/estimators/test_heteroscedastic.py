@@ -487,6 +487,55 @@ def test_a_step_without_variance_does_not_distort_its_neighbours(grouped):
 # --- parameters
 
 
+@pytest.mark.filterwarnings("ignore:y has 2 demonstrations")
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+@pytest.mark.parametrize("n_demos", [2, 4])
+def test_identical_demonstrations_have_the_least_variance_whatever_is_common_to_them(n_demos, noise, rng):
+    t = np.linspace(0.0, 2.0, 60)
+    y = np.column_stack([np.sin(3.0 * t), t**2]) + noise * rng.normal(size=(60, 2))
+    model = HeteroscedasticGPRegressor()
+    with pytest.warns(DataRankWarning, match="identical"):
+        model.fit(np.tile(t, n_demos)[:, np.newaxis], np.tile(y, (n_demos, 1)), groups=np.repeat(range(n_demos), 60))
+    mean, deviation = model.predict(t[:, np.newaxis], return_std=True)
+    np.testing.assert_allclose(mean, y, atol=1e-4)
+    assert deviation.max() < 1e-5  # 0.085 of a movement 0.055 wide, once
+
+
+def test_a_row_written_twice_does_not_make_demonstrations_identical(rng):
+    t = np.append(np.linspace(0.0, 1.0, 50), 0.0)
+    y = np.sin(t) + 0.1 * rng.normal(size=51)
+    y[50] = y[0]
+    deviation = HeteroscedasticGPRegressor().fit(t[:, np.newaxis], y).predict(t[:, np.newaxis], return_std=True)[1]
+    assert 0.05 < np.median(deviation) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("stations", "n_demos", "smooth", "white"),
+    [([0.0, 0.5, 1.0], 20, 0.1, 0.02), (np.linspace(0.0, 1.9, 20), 8, 0.05, 0.005)],
+)
+def test_samples_that_are_stamped_in_pairs_say_what_one_of_each_pair_says(stations, n_demos, smooth, white):
+    for seed in range(3):  # deviations of up to 1e7 between the pairs, or the prior's, once
+        rng = np.random.default_rng(seed)
+        t = np.sort(np.concatenate([stations, np.add(stations, 0.001)]))
+        y = t + smooth * rng.normal(size=(n_demos, 1)) + white * rng.normal(size=(n_demos, len(t)))
+        groups = np.repeat(range(n_demos), len(t))
+        model = HeteroscedasticGPRegressor().fit(np.tile(t, n_demos)[:, np.newaxis], y.ravel(), groups=groups)
+        grid = np.linspace(0.0, t[-1], 201)[:, np.newaxis]
+        mean, deviation = model.predict(grid, return_std=True)
+        np.testing.assert_allclose(deviation, np.hypot(smooth, white), rtol=0.7)
+        np.testing.assert_allclose(mean, grid[:, 0], atol=smooth)
+        assert model.predict_uncertainty(grid).type1.max() < 0.01
+
+
+@pytest.mark.parametrize(
+    ("stations", "unknown"), [([0.0, 0.01, 0.02, 0.03, 0.04, 0.05, 1.0], [0.5, 2.0]), ([0.0, 1.0], [2.0])]
+)
+def test_few_stations_have_holes_and_an_outside_too(stations, unknown, rng):
+    X = np.repeat(stations, 20)[:, np.newaxis]
+    model = HeteroscedasticGPRegressor().fit(X, X + 0.1 * rng.normal(size=(len(X), 2)))
+    assert model.predict_uncertainty(np.transpose([unknown])).type1.min() > 0.95
+
+
 def test_a_length_scale_that_is_given_is_held():
     model = new("heteroscedastic", length_scale=0.7).fit(*demonstrations())
     process = model.module_.core.processes.covariance

@@ -179,7 +179,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         period = period_in_ranges(self.period, self.kernel, scaling.x_scale)
         held, circle = (None if value is None else self._door(value) for value in (length_scale, period))
         prior_tril = self._prior_tril(training, scaling)
-        warn_if_identical(training)
+        identical = warn_if_identical(training)
         # A mean that does not follow the data at the merged inputs is fitted anew, from all rows.
         rows, training = training, training.merged(self.max_inputs)
         group = None if groups is None else self._door(groups).long()
@@ -189,7 +189,8 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         to_try = candidate_families(
             training.inputs, len(rows.inputs), sizes, kernel=kernel, period=circle, length_scale=held
         )
-        fit = fit_heteroscedastic(training, group, to_try, options, rows=rows if self.n_inducing is None else None)
+        begin_anew = rows if self.n_inducing is None else None
+        fit = fit_heteroscedastic(training, group, to_try, options, rows=begin_anew, identical=identical)
         # A callable prior is asked again at every prediction.
         model = HeteroscedasticModel(fit, prior_tril if prior_tril.ndim == 2 else prior_tril[0])
         least = model.processes.covariance.log_variances.family.shortest_length_scale

@@ -222,12 +222,19 @@ def warn_if_few(
         )
 
 
-def warn_if_identical(training: TrainingSet) -> None:
-    """Warn of outputs that, up to rounding, never vary at repeated inputs, or anywhere if no input repeats."""
+def warn_if_identical(training: TrainingSet) -> bool:
+    """Warn of outputs that, up to rounding, never vary where inputs repeat; whether most inputs do, and none varies.
+
+    Outputs are constant where no input repeats.
+    """
     repeated = len(training.y) - len(training.inputs)
     squares = training.squares if repeated else (training.y - training.y.mean(0)).square()
-    if float(squares.sum(0).max()) < 1e-18 * max(1, repeated or len(training.y) - 1):
+    identical = float(squares.sum(0).max()) < 1e-18 * max(1, repeated or len(training.y) - 1)
+    if repeated:  # a row or two that were written twice say nothing of the others
+        identical &= bool((training.counts > 1).double().mean() > 0.5)
+    if identical:
         checks.warn(ALIKE, DataRankWarning)
+    return identical and repeated > 0
 
 
 def fit_with_groups(regressor: Any, X: ArrayLike, y: ArrayLike, groups: ArrayLike) -> Any:

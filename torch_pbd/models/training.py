@@ -1,5 +1,6 @@
 """Training rows by distinct input, and the statistics of them to which models are fitted."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -9,9 +10,10 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from torch_pbd.gp.observations import neighbourhoods, sum_by
+from torch_pbd.gp.observations import neighbourhoods, spacing, sum_by
 from torch_pbd.linalg import scale_tril_from_root
 
+_NEAR = 0.1  # of the spacing of the inputs: no length scale tells apart what is so near
 _CHUNK = 1024  # inputs that a mean is evaluated at together: its correlations take 8 kB for each, of 1000 inputs
 
 
@@ -56,7 +58,25 @@ class TrainingSet:
         """Rows with at most ``max_inputs`` distinct inputs: neighbours are taken together."""
         if len(self.inputs) <= max_inputs:
             return self
-        index = neighbourhoods(self.inputs, max_inputs)[self.index]
+        return self._by(neighbourhoods(self.inputs, max_inputs))
+
+    def without_near_pairs(self) -> "TrainingSet":
+        """Rows with inputs on a line taken together where they are far nearer than most are: stamps written twice."""
+        if self.inputs.shape[1] > 1 or len(self.inputs) < 2:
+            return self
+        near, first, run = _NEAR * spacing(self.inputs), -math.inf, -1
+        runs = []
+        order = self.inputs[:, 0].argsort(stable=True)
+        for place in self.inputs[order, 0].tolist():
+            if place - first > near:
+                first, run = place, run + 1
+            runs.append(run)
+        if run + 1 == len(runs):
+            return self
+        return self._by(torch.empty_like(order).index_copy(0, order, torch.tensor(runs, device=order.device)))
+
+    def _by(self, neighbourhood: Int64[Tensor, " n"]) -> "TrainingSet":
+        index = neighbourhood[self.index]
         counts = torch.bincount(index).to(self.x)
         return replace(self, inputs=sum_by(self.x, index) / counts[:, None], index=index)
 

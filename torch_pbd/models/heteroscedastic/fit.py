@@ -61,6 +61,8 @@ class HeteroscedasticFit:
 
     training: TrainingSet
     group: Int64[Tensor, " rows"] | None
+    identical: bool
+    """Whether rows at an input never vary: their variance is the least, whatever a mean leaves of them."""
     families: Families
     larger: Families | None
     options: SearchOptions
@@ -84,6 +86,8 @@ class HeteroscedasticFit:
         self._n_outputs = self.training.y.shape[1]
         self.n_demos = 1 if self.group is None else int(self.group.max()) + 1
         self._quantum = quantum(self.training.y)
+        if self.identical:
+            self._quantum.clamp_min_(12.0**0.5 * _LEAST_DEVIATION)
         self._mean_search = Search(self.families.mean, self._n_outputs, self.options)
         self.search = CovarianceSearch(self.families.log_variance, self._n_outputs, self.options)
 
@@ -92,6 +96,9 @@ class HeteroscedasticFit:
         noise = self.noise_correlation(self.mean_rows, squares=False)
         self.mean = fit_mean(self._mean_search, self.mean_rows, self.noise_tril(self.mean_rows.inputs), noise)
         self.residual = self.mean.residual(self.training)
+        if self.identical:
+            self.residual.zero_()
+            return
         if anew is None or self._follows():
             return
         if (start := mean_start(anew, self.mean, self.pooled_tril, self.options)) is not None:
@@ -162,7 +169,7 @@ class HeteroscedasticFit:
 
     def correlate(self) -> None:
         """Estimate the correlation of a demonstration's samples from e = inv(L) w."""
-        if self.group is None:
+        if self.group is None or self.identical:
             return
         self.correlation = demonstration_correlation(self.training.x, self.whitened(), self.group)
         if self.correlation is not None:
@@ -170,6 +177,9 @@ class HeteroscedasticFit:
             # themselves, which takes three more than outputs.
             n_rows = max(self.n_demos, self._n_outputs + 3)
             self.training = self.training.merged(max(8, len(self.training.x) // n_rows))
+            # Of inputs far nearer than a demonstration is correlated the difference would count as known exactly, and
+            # a covariance that has it as its slope is anything where the next inputs are far.
+            self.training = self.training.without_near_pairs()
             self.mean_rows = self.training if self._mean_search.held is None else self.mean_rows.merged(MOST_INPUTS)
 
     def normal(self) -> Float[Tensor, "rows d"]:
@@ -207,6 +217,7 @@ def fit_heteroscedastic(
     options: SearchOptions,
     *,
     rows: TrainingSet | None = None,
+    identical: bool = False,
 ) -> HeteroscedasticFit:
     """Mean under the noise learned so far, then covariance of the residuals from it, by turns.
 
@@ -216,7 +227,7 @@ def fit_heteroscedastic(
     last. Of ``rows``, at all their inputs, the mean begins anew where the first one does not follow the data.
     """
     larger = to_try[1] if len(to_try) > 1 else None
-    fit = HeteroscedasticFit(training, group, to_try[0], larger, options)
+    fit = HeteroscedasticFit(training, group, identical, to_try[0], larger, options)
     # Share of the rows that count before the correlation of a demonstration's samples is known.
     first_part = 1.0 if group is None else min(1.0, _FIRST_SAMPLES * fit.n_demos / len(group))
     started, turn, n_turns = time.perf_counter(), 0, _TURNS
