@@ -259,6 +259,8 @@ def _of_rows(models: dict[str, Any], why: str) -> dict[str, Any]:
     kept = {name: model for name, model in models.items() if type(model).__name__ not in MOVEMENTS}
     if not kept:
         raise ConfigError(f"models: there are only such of whole movements, which cannot be compared: {why}.")
+    if left := [name for name in models if name not in kept]:
+        say(f"without {', '.join(left)}, as models of whole movements cannot be compared here: {why}\n")
     return kept
 
 
