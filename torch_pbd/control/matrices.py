@@ -166,9 +166,10 @@ def masses_like(mass: float | Tensor, like: Tensor, name: str) -> Tensor:
     return matrix
 
 
-def mass_rows(mass: Any, like: Tensor) -> Tensor:
-    """Inertia (d, d), or (..., T, d, d) with one per tick, for gains (..., T, d, d)."""
-    rows = masses_like(as_mass(mass), like, "stiffness")
+def mass_rows(mass: Any, own: Any, times: Any, like: Tensor) -> Tensor:
+    """Inertia (d, d) or (..., T, d, d), as gains ``like``; a function is of ``times``, None a schedule's or 1 kg."""
+    given = mass(times) if callable(mass) else own if mass is None else mass
+    rows = masses_like(as_mass(1.0 if given is None else given), like, "stiffness")
     if rows.ndim == 2:
         return rows
     # Equal rows are one mass, unless they require gradients, which are then per row.

@@ -176,8 +176,7 @@ class AdmittancePlant:
         orientation_desired: Tensor | None = None,
     ) -> Task:
         """Task of this plant from checked arguments of :meth:`simulate`, the times of ticks and a schedule's mass."""
-        mass = self.mass(times) if callable(self.mass) else own_mass if self.mass is None else self.mass
-        mass = mass_rows(1.0 if mass is None else mass, stiffness)
+        mass = mass_rows(self.mass, own_mass, times, stiffness)
         inertial = torch.zeros_like(velocity_desired)
         if self.feed_forward:
             if acceleration_desired is None:  # that which takes the velocity of each tick to that of the next

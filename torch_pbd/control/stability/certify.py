@@ -70,8 +70,7 @@ def certify(
     # A free axis never returns, so that nothing can be certified.
     checks.semidefinite(schedule.stiffness, "stiffness", definite=True)
     time, stiffness, damping = map(torch.tensor, (schedule.time, schedule.stiffness, schedule.damping))
-    given = schedule.mass if mass is None else mass(schedule.time) if callable(mass) else mass
-    inertia = mass_rows(1.0 if given is None else given, stiffness).detach()
+    inertia = mass_rows(mass, schedule.mass, schedule.time, stiffness).detach()
     inertia = inertia if inertia.ndim == 3 else inertia[None]  # one for all rows
     transport = None
     if schedule.orientation is not None and schedule.velocity[:, -3:].any():
