@@ -84,6 +84,7 @@ def test_the_yaml_is_a_configuration_of_experiment(learned, tmp_path):
     schedule = learning.follow(learned)["schedule"]
     np.testing.assert_array_equal(mine.schedule(rate=1000.0).stiffness, schedule.stiffness)
     assert yaml.safe_load(path.read_text())["data"] == "demonstrations.csv"
+    assert "# Without points that bend it, and at its own speed: see skill.py." in path.read_text().splitlines()
 
 
 def test_a_dropped_file_is_read_whatever_its_name(learned):

@@ -187,7 +187,11 @@ schedule.save("schedule.npz")
 def _yaml(learned: Learned) -> str:
     mine = _spec(_controller(_model(next(iter(learned.controllers))), learned.settings))
     content = {"data": "demonstrations.csv", "controllers": {"mine": mine}}
-    return "# torch-pbd experiment --config skill.yaml\n" + str(yaml.safe_dump(content, sort_keys=False))
+    lines = [
+        "torch-pbd experiment --config skill.yaml",
+        "Without points that bend it, and at its own speed: see skill.py.",
+    ]
+    return "".join(f"# {line}\n" for line in lines) + str(yaml.safe_dump(content, sort_keys=False))
 
 
 def _spec(value: Any) -> Any:
