@@ -4,6 +4,7 @@ import difflib
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from itertools import pairwise
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
@@ -252,8 +253,11 @@ def _column(signals: Mapping[str, NDArray[Any]], place: tuple[str, int]) -> NDAr
     return values if values.ndim == 1 else values[:, place[1]]
 
 
-def _rows_of(demo: NDArray[Any], heads: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+def _rows_of(demo: NDArray[Any], heads: NDArray[np.intp]) -> Sequence[slice | NDArray[np.intp]]:
     """Rows of each demonstration, in the order of their first ones; ``heads`` are the rows that begin a run."""
-    _, first, inverse = np.unique(demo[heads], return_index=True, return_inverse=True)  # of runs, which are few
+    _, first, inverse = np.unique(demo[heads], return_index=True, return_inverse=True)
+    # Most tables have one run of rows for each, which take no copies; else runs are sorted, not rows.
+    if len(first) == len(heads):
+        return [slice(a, b) for a, b in pairwise([*heads.tolist(), len(demo)])]
     rank = np.repeat(np.argsort(np.argsort(first))[inverse], np.diff(np.r_[heads, len(demo)]))
-    return np.split(np.argsort(rank, kind="stable"), np.cumsum(np.bincount(rank)))[:-1]
+    return np.split(np.argsort(rank, kind="stable"), np.cumsum(np.bincount(rank))[:-1])
