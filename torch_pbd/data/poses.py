@@ -163,9 +163,9 @@ def find_suspects(positions: Sequence[Floats], names: Sequence[str], units: Sequ
 def quaternions(positions: Sequence[Floats]) -> list[int]:
     """Indices of outputs that begin four columns of unit quaternions."""
     found, first = [], 0
-    together = np.concatenate(positions).clip(-_LARGEST_ANGLE, _LARGEST_ANGLE)
-    while first + 4 <= together.shape[1]:
-        four = together[:, first : first + 4]
+    while first + 4 <= positions[0].shape[1]:
+        four = np.concatenate([position[:, first : first + 4] for position in positions])
+        four = four.clip(-_LARGEST_ANGLE, _LARGEST_ANGLE)
         off = np.abs(np.square(four).sum(axis=1) - 1.0)
         spread = np.ptp(four, axis=0).max()
         if spread > 0.0 and np.mean(off <= min(_OFF_SPHERE, _OFF_SPHERE_SHARE * spread)) >= _SAMPLES_ON_SPHERE:
