@@ -39,14 +39,15 @@ def _read_columns(file: Any, names: Sequence[str], wanted: Wanted) -> dict[str, 
     metadata = file.metadata
     packed = sum(metadata.row_group(i).total_byte_size for i in range(metadata.num_row_groups))
     wanted.require(max(packed, 8.0 * metadata.num_rows * len(names)), "it")
-    columns = {}
-    for name in names:
-        batches = file.iter_batches(_ROWS, columns=[name], use_threads=False)
-        parts = [_as_array(batch.column(name)) for batch in batches] or [np.empty(0)]
-        if len({part.shape[1:] for part in parts}) > 1:
-            raise ValueError(f"column {name!r} has lists that differ in length.")
-        columns[name] = np.concatenate(parts)  # whole numbers become floats where some are absent
-    return columns
+    return {name: _read_column(file, name) for name in names}
+
+
+def _read_column(file: Any, name: str) -> NDArray[Any]:
+    batches = file.iter_batches(_ROWS, columns=[name], use_threads=False)
+    parts = [_as_array(batch.column(name)) for batch in batches] or [np.empty(0)]
+    if len({part.shape[1:] for part in parts}) > 1:
+        raise ValueError(f"column {name!r} has lists that differ in length.")
+    return np.concatenate(parts)  # whole numbers become floats where some are absent
 
 
 def _as_array(column: Any) -> NDArray[Any]:
