@@ -55,6 +55,14 @@ def test_it_comes_to_rest_at_the_goal_and_stays(controller):
     assert 0.0 <= beyond < 0.06 * 1.0 / 6.25  # tau v_end / beta, what it would be without a gate
 
 
+def test_the_goal_is_held_at_first_and_the_robot_compliant_long_after_the_end(controller):
+    at_end, soon, late = (
+        np.linalg.eigvalsh(controller.schedule(20.0, settle=settle).stiffness[-1]) for settle in (0.0, 1.0, 10.0)
+    )
+    np.testing.assert_allclose(soon, at_end, rtol=0.02)
+    np.testing.assert_allclose(late, 50.0)
+
+
 def test_the_papers_primitive_goes_past_the_goal(tunnel):
     paper = DMPController(**PAPER).fit(tunnel)
     beyond = paper.predict(np.array([[45.0]]))[0, 1] - paper.goal_[1]

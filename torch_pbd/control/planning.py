@@ -162,8 +162,9 @@ class Planning(BaseEstimator):
             Rate of the rows in Hz; the last row is at the end, ``duration_ / speed + settle``, and may follow sooner.
         settle : float, default=0.0
             Extra time in s after the movement, in which it comes to rest at the goal. A movement that was cut while
-            moving brakes along its path, half before its end and half after. No data exist after the end, so that
-            on_unknown="soft" makes the robot compliant there.
+            moving brakes along its path, half before its end and half after. Gains are at first those of the goal.
+            Later, by about a duration after the end unless phase_input="s", no data are near, and on_unknown="soft"
+            makes the robot compliant.
         goal, start : array-like of shape (d,), default=None
             Goal and start in the units of the recordings; None are ``goal_`` and ``start_``. A moving goal is (n, d),
             one row each, without ``via``. Poses, here and in ``via``, are p positions and a unit quaternion w x y z, or
