@@ -23,7 +23,6 @@ from torch_pbd.control.realtime.motion import Motion
 from torch_pbd.control.realtime.steps import Vector
 from torch_pbd.control.realtime.table import ScheduleTable
 from torch_pbd.control.schedule import Schedule
-from torch_pbd.control.schedule.rows import refuse_other_units
 
 _FINE = TickStatus(0)  # made once: to make one takes a third of a tick
 _SHARED = "this controller is in a tick already: two threads share it. Give each its own."
@@ -135,7 +134,7 @@ class RealTimeAdmittance:
         force_rate_limit: Option = None,
         stiffness_filter: StiffnessFilter | None = None,
     ) -> None:
-        refuse_other_units(checks.instance(schedule, "schedule", Schedule))
+        checks.instance(schedule, "schedule", Schedule)
         given = {"force_limit": force_limit, "spring_limit": spring_limit, "deadband": deadband}
         given |= {"force_rate_limit": force_rate_limit, "velocity_limit": velocity_limit}
         given |= {"acceleration_limit": acceleration_limit, "approach_speed": approach_speed}

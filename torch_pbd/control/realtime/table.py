@@ -12,7 +12,7 @@ from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control.realtime.steps import State, Vector, advance_plane, along_modes, coupled, deviation, moved
 from torch_pbd.control.schedule import Schedule
-from torch_pbd.control.schedule.rows import Between, count_rows, row_times, warn_of_another_mass
+from torch_pbd.control.schedule.rows import Between, count_rows, refuse_other_units, row_times, warn_of_another_mass
 
 Scale = float | Vector
 """Scale of the stiffness: that of all, or those of positions and of rotations."""
@@ -38,6 +38,7 @@ class ScheduleTable:
     def __init__(
         self, schedule: Schedule, mass: Any, rate: float, pull_limits: Vector, *, steady: bool = False
     ) -> None:
+        refuse_other_units(schedule)
         if mass is not None:
             schedule, own = replace(schedule, mass=mass), schedule
             warn_of_another_mass(own, np.asarray(schedule.mass), "mass is another")
