@@ -228,6 +228,7 @@ WRONG = [
 WRONG_TIMES = [
     "sec", "secs", "seconds", "Second", "S", "Ms", "MS", "milliseconds", "Milliseconds", "millisecnds", "NS", "nsec",
     "usec", "µs", "minutes", "mins", "Min", "hours", "hr", "H", "nanoseconds", "microsecond",
+    "m", "mm", "deg",
 ]  # fmt: skip
 OWN = [
     "pixels", "px", "tablet units", "arbitrary drawing units", "normalized", "normalized by the authors", "N", "Nm",

@@ -35,8 +35,9 @@ def check_unit(unit: str, name: str, known: dict[str, float]) -> None:
     folded = unit.strip(" .").casefold()
     forms = {folded, folded.removesuffix("s")}
     close = forms & {*known, *_SPELLED} or difflib.get_close_matches(folded, _LONG, n=1, cutoff=_CLOSE)
-    if unit not in LENGTHS | ANGLES | TIMES and close:
-        listed = "; ".join(", ".join(kind) for kind in (LENGTHS, ANGLES, TIMES))
+    kinds = (TIMES,) if known is TIMES else (LENGTHS, ANGLES, TIMES)
+    if not any(unit in kind for kind in kinds) and (close or unit in LENGTHS | ANGLES):  # "m" for minutes
+        listed = "; ".join(", ".join(kind) for kind in kinds)
         remedy = "convert what is in others; words like none of them, such as 'pixels', are units of their own"
         raise refusal(unit, name, f"written as one of the known units, {listed}", remedy)
 
