@@ -93,6 +93,16 @@ def test_paths_and_options_are_checked(tmp_path):
         load_demonstrations(tmp_path / "set.csv", sep=";")
     with pytest.raises(ValueError, match="an output named 'time'"):
         save_demonstrations(Demonstrations([0, 1], [[1, 2]], names=["time"]), tmp_path / "set.csv")
+    for name in ("", "x ", "__index_level_0__"):
+        with pytest.raises(ValueError, match=f"an output named '{name}' cannot be read back from the header"):
+            save_demonstrations(Demonstrations([0, 1], [[1, 2]], names=[name]), tmp_path / "set.csv")
+
+
+def test_names_that_are_numbers_are_names_beside_others_that_are_none(tmp_path):
+    numbered = Demonstrations([0, 1], [[1, 2]], names=["1"])
+    save_demonstrations(numbered, tmp_path / "set.csv")
+    assert load_demonstrations(tmp_path / "set.csv") == numbered
+    assert load_text(tmp_path, "sep=;\ntime;1\n0;1\n1;2\n", outputs=["1"]) == numbered
 
 
 def test_large_files_are_refused_before_they_are_read(tmp_path):
@@ -211,6 +221,14 @@ def test_columns_of_csv_are_chosen_and_ordered(tmp_path):
         (CSV, {"outputs": ["z"]}, "line 1: no column 'z'"),
         ("demo,time,x,x\n", {}, "line 1: there are two columns 'x'"),
         ("demo,time,x\n", {}, "is empty"),
+        ("0,0,1,2\n0,1,1.5,2.5\n", {}, "line 1: it must name the columns, and has numbers: [0, 0, 1, 2]"),
+        ("0,7,nan,2\n0,8,1.5,2.5\n", {}, "line 1: it must name the columns, and has numbers: [0, 7, nan, 2]"),
+        (
+            "demo|time|x\n",
+            {},
+            "line 1: no columns but one, 'demo|time|x', by [',', ';', '\\t'] and the decimal mark '.'",
+        ),
+        ("sep=;\ndemo;time;x\n0;0;1\n0;1;a\n", {}, "line 4, column 'x': 'a' is not a finite number"),
         (CSV.replace("5,6", ",6"), {}, "line 4, column 'x': the cell is blank"),
         (CSV.replace("b,0.0", ",0.0"), {}, "line 4, column 'demo': the cell is blank"),
         (CSV.replace("3,4", "3,nan"), {}, "line 3, column 'y': 'nan' is not a finite number"),

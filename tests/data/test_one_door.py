@@ -6,6 +6,7 @@ import subprocess
 import sys
 import warnings
 from datetime import UTC, datetime, timedelta
+from decimal import Decimal
 
 import numpy as np
 import pandas as pd
@@ -211,6 +212,22 @@ def test_frames_of_other_libraries_are_taken(library):
     assert made == Demonstrations([[0, 1, 2]] * 2, expected, names=["y", "x"], time_unit="ms")
 
 
+def test_labels_may_be_of_several_kinds():
+    table = pd.DataFrame({"demo": ["a", 1, "a", 1], "time": [0.0, 0.0, 1.0, 1.0], "x": [0.5, 1.0, 2.0, 4.0]})
+    assert [position.ravel().tolist() for _, position in Demonstrations.from_frame(table)] == [[0.5, 2.0], [1.0, 4.0]]
+
+
+@pytest.mark.parametrize("blank", [None, pd.NA, np.nan])
+def test_objects_that_are_numbers_are_numbers_and_may_be_missing(blank):
+    columns = {"time": [0, 1.0, 2.0, blank], "x": [True, blank, False, True], "y": [Decimal("1.5"), 2, 3, 4]}
+    table = pd.DataFrame({name: pd.Series(values, dtype=object) for name, values in columns.items()})
+    with pytest.raises(ValueError, match="missing='drop' leaves such samples out"):
+        Demonstrations.from_frame(table)
+    with pytest.warns(MissingDataWarning, match="2 of 4"):
+        kept = Demonstrations.from_frame(table, missing="drop")
+    assert kept == Demonstrations([0.0, 2.0], [[[1.0, 1.5], [0.0, 3.0]]], names=["x", "y"])
+
+
 def test_frames_have_the_guards_of_files():
     dates = pd.date_range("2026-01-01", periods=3, freq="20ms")
     table = pd.DataFrame({"when": dates, "x": X[:, 0], "label": list("abc")}).reset_index()
@@ -368,6 +385,8 @@ def test_loader_options_are_on_the_command_line_and_in_yaml(tmp_path, capsys):
     told = capsys.readouterr().err
     assert "no column 'time' among [trial, stamp, px, py, note]: say time='stamp', if that is it" in told
     assert "Here time= is written --loader.time." in told
+    assert main([*arguments, *options, "--loader.outputs", "[pz]"]) == 1
+    assert "name the one meant by outputs=. Here outputs= is written --loader.outputs." in capsys.readouterr().err
     assert main([*arguments, "--loader.outpust", "px"]) == 2
     assert "no option 'outpust'; did you mean 'outputs'?" in capsys.readouterr().err
     assert main(["fit", "--data", str(tmp_path / "gone_*.csv"), *FIT, *output]) == 2

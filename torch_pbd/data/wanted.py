@@ -4,7 +4,9 @@ import difflib
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from decimal import Decimal
 from itertools import pairwise
+from numbers import Real
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
@@ -18,7 +20,7 @@ from torch_pbd.files.memory import require_memory
 
 _FEWEST_COUNTED = 5  # fewest rows that identify a count; fewer increase by one by chance
 MAX_BYTES = 512 * 2**20
-_UNNAMED = ("", "__index_level_0__")  # names of a table's index in files written by pandas
+UNNAMED = ("", "__index_level_0__")  # names of a table's index in files written by pandas
 Arguments = dict[str, Any]
 _Recorded = TypeVar("_Recorded", bound=Any)  # Demonstrations, whose import would be circular
 
@@ -100,14 +102,15 @@ class Wanted:
             names = [column for name in named for column in ([name] if name in places else signals.get(name, [name]))]
             names += [name for name in self.rotation or () if name not in names]
         else:
-            names = [name for name in places if name not in (*taken, *_UNNAMED)]
-            for place in [i for i, name in enumerate(places) if name in _UNNAMED and name not in taken]:
+            names = [name for name in places if name not in (*taken, *UNNAMED)]
+            for place in [i for i, name in enumerate(places) if name in UNNAMED and name not in taken]:
                 index = f"column {place + 1} has no name, as the index of a table written without index=False"
                 remedy = f"leave it out, or say by outputs= which of {preview(names)} are movements"
                 self.refuse(f"{index}: {remedy}.", "outputs")
         absent = [repr(name) for name in (*taken, *names) if name not in places] or ["of outputs"] * (not names)
         if absent:
-            remedy = "name the columns by demo=, time= (or rate=, in Hz, where there are none) and outputs="
+            options = {repr(demo): "demo=", repr(time): "time= (or rate=, in Hz, where there are none)"}
+            remedy = f"name the one meant by {options.get(absent[0], 'outputs=')}"
             raise ValueError(f"no column {absent[0]} among {preview([*places])}: {remedy}.")
         time = None if self.rate is not None else time
         return Chosen(places.get(demo), places.get(time), [places[name] for name in names], names)
@@ -146,12 +149,12 @@ class Wanted:
                 if n != widths.setdefault(name, n):
                     must = f"must have {widths[name]} as that of the first: select others by outputs=, or mend the file"
                     raise ValueError(f"array {name!r} of demonstration {k} has {n} columns, {must}.")
-            columns = [_column(signals, place) for place in chosen.outputs]
+            columns = [_numbers(_column(signals, place)) for place in chosen.outputs]
             for name, values in zip(chosen.names, columns, strict=True):
                 if values.dtype.kind not in "biuf":
                     raise ValueError(f"column {name!r} holds {values.dtype}, no numbers: leave it out by outputs=.")
             positions.append(frozen(np.stack(columns, axis=1)))
-            times.append(_column(signals, chosen.time) if chosen.time else np.arange(len(columns[0])))
+            times.append(_numbers(_column(signals, chosen.time)) if chosen.time else np.arange(len(columns[0])))
             if hasattr(stamp := next(iter(times[-1]), None), "isoformat"):  # one of Python's
                 raise checks.refusal(stamp, "time", "a datetime64 or a number", "convert the column")
         given = {name: getattr(self, name) for name in ("units", "frame", "rotation", "angles", "time_unit")}
@@ -253,11 +256,21 @@ def _column(signals: Mapping[str, NDArray[Any]], place: tuple[str, int]) -> NDAr
     return values if values.ndim == 1 else values[:, place[1]]
 
 
+def _numbers(values: NDArray[Any]) -> NDArray[Any]:
+    """Values, but for objects that are numbers: these as NumPy's own, and None and NA as NaN."""
+    if values.dtype != object:
+        return values
+    known = [np.nan if value is None or repr(value) == "<NA>" else value for value in values]
+    known = [float(value) if isinstance(value, Decimal) else value for value in known]
+    return np.array(known) if all(isinstance(value, Real) for value in known) else values
+
+
 def _rows_of(demo: NDArray[Any], heads: NDArray[np.intp]) -> Sequence[slice | NDArray[np.intp]]:
     """Rows of each demonstration, in the order of their first ones; ``heads`` are the rows that begin a run."""
-    _, first, inverse = np.unique(demo[heads], return_index=True, return_inverse=True)
+    ranks: dict[Any, int] = {}  # of labels of any kind, which need not compare
+    each = [ranks.setdefault(label, len(ranks)) for label in demo[heads].tolist()]
     # Most tables have one run of rows for each, which take no copies; else runs are sorted, not rows.
-    if len(first) == len(heads):
+    if len(ranks) == len(heads):
         return [slice(a, b) for a, b in pairwise([*heads.tolist(), len(demo)])]
-    rank = np.repeat(np.argsort(np.argsort(first))[inverse], np.diff(np.r_[heads, len(demo)]))
+    rank = np.repeat(each, np.diff(np.r_[heads, len(demo)]))
     return np.split(np.argsort(rank, kind="stable"), np.cumsum(np.bincount(rank))[:-1])

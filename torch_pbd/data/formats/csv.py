@@ -17,7 +17,7 @@ from torch_pbd import checks
 from torch_pbd.data.demonstrations import Demonstrations
 from torch_pbd.data.poses import as_columns
 from torch_pbd.data.recordings import preview
-from torch_pbd.data.wanted import Arguments, Wanted
+from torch_pbd.data.wanted import UNNAMED, Arguments, Wanted
 from torch_pbd.files import LOADERS
 
 _DELIMITERS = (",", ";", "\t")
@@ -45,8 +45,8 @@ def write(demonstrations: Demonstrations, handle: BinaryIO) -> None:
     """Write columns ``demo,time,<names>`` with the shortest decimals that read back to the last bit."""
     names, columns = as_columns(demonstrations)
     for name in names:
-        if name != name.strip():
-            raise ValueError(f"an output named {name!r} has blanks at its ends, which text loses: rename it.")
+        if name != name.strip() or name in UNNAMED:
+            raise ValueError(f"an output named {name!r} cannot be read back from the header of a CSV file: rename it.")
     text = io.TextIOWrapper(handle, encoding="utf-8", newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["demo", "time", *names])
@@ -61,6 +61,8 @@ class _Table:
     def __init__(self, file: TextIO, delimiter: str | None, decimal: str, wanted: Wanted) -> None:
         self.file, self.decimal, self.missing = file, decimal, wanted.missing
         first, self.n_before = _header_line(file)
+        if excel := re.fullmatch(r'"?sep=(.)"?\s*', first):
+            delimiter, first, self.n_before = excel[1], file.readline(_LONGEST_HEADER), self.n_before + 1
         candidates = [delimiter] if delimiter else [mark for mark in _DELIMITERS if mark != decimal]
         try:
             if first.startswith("# format:"):
@@ -69,12 +71,17 @@ class _Table:
             # A mark that is not the delimiter finds one column, or cuts names that hold it.
             sought = {wanted.demo, wanted.time or "time", *(wanted.outputs or ())}
             self.header = max(headers, key=lambda names: (len(sought & set(names)), len(names)))
+            if self.header and all(
+                _is_number(name) or _CLOCK.fullmatch(name) or name.lower() in _MISSING for name in self.header
+            ):
+                raise ValueError(f"it must name the columns, and has numbers: {preview(self.header)}.")
+            if len(self.header) == 1 and wanted.rate is None:
+                what = f"no columns but one, {self.header[0]!r:.80}, by {candidates} and the decimal mark {decimal!r}"
+                raise ValueError(f"{what}: say what parts them by delimiter=, or rate= (in Hz) if there are no times.")
             twice = [name for name, count in Counter(self.header).items() if name and count > 1]
             if twice:
                 raise ValueError(f"there are two columns {twice[0]!r}.")
             self.chosen = wanted.choose({name: (name,) for name in self.header}, demo="demo", time="time")
-            if any(map(_is_number, self.header)):
-                raise ValueError(f"it must name the columns, and has numbers: {preview(self.header)}.")
         except (ValueError, csv.Error) as error:
             raise ValueError(f"line {self.n_before}: {str(error).rstrip('.')}.") from error
         self.delimiter, self.start = candidates[headers.index(self.header)], file.tell()
