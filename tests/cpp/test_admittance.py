@@ -9,6 +9,7 @@ import pytest
 from control.loops import MASS, arm_inertia, as_schedule, constant, make_pose_schedule, make_schedule
 from cpp.bridge import ROOT, Both, CppAdmittance, compiled, needs_compiler
 from faults.test_random_loops import Loop, random_schedule
+from hypothesis import settings
 
 from torch_pbd import rotations
 from torch_pbd.control.realtime import RealTimeAdmittance, TickStatus
@@ -136,11 +137,13 @@ def begin(both, schedule, now, rng):
 
 # At 1e5 N/s a force of 200 N would be there in two ticks, and rounding would say whether the second one was limited.
 LONG = {"deadband": 0.05, "velocity_limit": 3.0, "force_rate_limit": 0.97e5}
+# Ten thousand take a second. A million: --hypothesis-profile=thorough.
+MANY = 1_000_000 if settings.get_current_profile_name() == "thorough" else 150_000
 
 
 @pytest.mark.parametrize(
     ("d", "n_ticks"),
-    [(2, 20_000), *(pytest.param(d, n, marks=pytest.mark.slow) for d, n in [(2, 1_000_000), (6, 1_000_000)])],
+    [(2, 20_000), *(pytest.param(d, n, marks=pytest.mark.slow) for d, n in [(2, MANY), (6, MANY)])],
 )
 def test_a_long_run_with_every_fault_stays_the_same(d, n_ticks, rng, tmp_path):
     schedule = make_schedule(d, duration=5.0)
@@ -150,7 +153,7 @@ def test_a_long_run_with_every_fault_stays_the_same(d, n_ticks, rng, tmp_path):
     print(f"largest difference after {n_ticks} ticks: {both.worst:.2g}")
 
 
-@pytest.mark.parametrize("n_ticks", [5_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n_ticks", [5_000, pytest.param(MANY, marks=pytest.mark.slow)])
 def test_a_long_run_of_poses_stays_the_same(n_ticks, rng, tmp_path):
     schedule = make_pose_schedule(3.0)
     pairs = {name: (value, 0.5 * value) for name, value in LONG.items()}
