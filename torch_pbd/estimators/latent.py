@@ -44,6 +44,8 @@ _LEVEL = 1e-4  # significance level of the lack-of-fit tests: how often a right 
 _CLEAR = 5.0  # standard errors that always reject a mean: with two rows at two inputs the t test would allow 100
 _LEAST_SPREAD = 0.03  # smallest credible spread at one input, as a share of the pooled spread
 _UNRESOLVED = 1e-10  # squared error in standardized outputs that a smooth process may always have
+# Rows for each function of a default length scale, and its longest, in ranges of one input.
+_ROWS_OF_A_FUNCTION, _LONGEST_OF_FEW = 40.0, 1.0
 _SPREAD = 0.01  # standard deviation of the random part of whitened values at the start
 _SHARE, _LEAST_NOISE = 0.1, 1e-6  # noise of a mean: share of its smallest error, and least share of the outputs' scale
 
@@ -61,8 +63,8 @@ prior : None, float, array-like of shape (d, d), callable or "paper", default=No
     X (n, e) to (n, d, d). None takes a wide one: four times the covariance of all of y. "paper" is an identity
     factor in the units of y for CD, and vectors whose means are all 8 for WP, which give a covariance of rank one.
 length_scale : float, array-like of shape (n_features,) or None, default=None
-    Length scale of the covariance's processes, in units of X. None learns it from empirical covariances, and takes a
-    fifth of the range otherwise.
+    Length scale of the covariance's processes, in units of X. None learns it from empirical covariances; otherwise it
+    takes a fifth of the range, times the root of the number of inputs, or with few rows more.
 max_inputs : int, default=256
     Largest number of distinct rows of X; if there are more, neighbours are merged. A fit costs the cube of it, and is
     linear in the rows. CD merges aligned data over one input only for length scales below a fortieth of the range;
@@ -242,13 +244,20 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         """Roots at the inputs at the maximum of the likelihood, and the latent values there.
 
         Training starts from a root, of processes from ``first_random`` on a little beside it. Length scales default to
-        a fifth of the range of the inputs, and to less beside a gap in them.
+        a fifth of the range of the inputs, to less beside a gap in them, and to more of few rows.
         """
         training, length_scale = problem.training, problem.length_scale
         n_inputs, n_features = training.inputs.shape
         if length_scale is None:
-            shortest = min(0.2, longest_within(training.inputs))
-            length_scale = training.inputs.new_full((n_features,), shortest * n_features**0.5)
+            shortest = 0.2 * n_features**0.5
+            if self.latent_prior:
+                # So many rows for each of the (1 + 0.8 / l)^e functions of length scale l, or the likeliest values
+                # explain each row by itself: of 120 rows of three inputs fresh ones lost 1e9 nats.
+                n_functions = max(1.001, len(residual) / _ROWS_OF_A_FUNCTION) ** (1.0 / n_features)
+                shortest = max(shortest, min(0.8 / (n_functions - 1.0), _LONGEST_OF_FEW * n_features**0.5))
+            if n_features == 1:
+                shortest = min(shortest, longest_within(training.inputs))
+            length_scale = training.inputs.new_full((n_features,), shortest)
         deviation = link.deviation(start).expand(n_inputs, -1).mT.contiguous()
         options: Any = {"kernel": self.kernel, "train_hyperparameters": not self.latent_prior}
         latent = LatentValues(training.inputs, deviation, link.amplitude(), length_scale[None], **options)
