@@ -175,6 +175,21 @@ def test_outputs_are_given_by_name_or_number_and_others_refused(strokes):
             strokes.plot(wrong)
 
 
+def test_what_cannot_be_drawn_together_is_refused_by_name(strokes, ax, rng):
+    deep = Demonstrations(np.arange(5.0), rng.normal(size=(3, 5, 3)))
+    with pytest.raises(ValueError, match=r"ax is .*must be Axes of projection='3d' for three outputs"):
+        deep.plot(ax=ax)
+    model = GMMBaseline(n_components=1).fit(*strokes.stack())
+    with pytest.raises(ValueError, match=r"demonstrations is .*must be a Demonstrations"):
+        MovementDisplay.from_estimator(model, strokes.stack()[0])
+    with pytest.raises(ValueError, match=r"demonstrations is .*must be with the 2 outputs that GMM"):
+        MovementDisplay.from_estimator(model, deep)
+    with pytest.raises(ValueError, match=r"names is \['a', 'b'\], must be 1, one for each model"):
+        MovementDisplay.from_estimator(model, strokes, names=["a", "b"])
+    with pytest.raises(ValueError, match=r"names is \['GMMBaseline', 'GMMBaseline'\], must be 2, .*no two alike"):
+        MovementDisplay.from_estimator(model, strokes, other=model)
+
+
 @pytest.mark.parametrize("input", ["time", "phase"])
 def test_a_display_has_the_law_of_the_model(strokes, input):
     model = GMMBaseline().fit(*strokes.stack(input))

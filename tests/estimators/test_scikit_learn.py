@@ -9,6 +9,7 @@ import warnings
 import joblib
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 import pytest
 import skops.io
 import torch
@@ -31,6 +32,7 @@ from estimators.zoo import (
     queries,
     random_states,
 )
+from torch_pbd import Demonstrations
 from torch_pbd.metrics import log_likelihood_scorer
 
 # Their data have no two inputs alike, where these two take longest; what is checked does not need an optimum.
@@ -253,6 +255,17 @@ def test_names_of_columns_are_kept_and_held_to(name):
         model.predict_cov(frame[["place", "time"]])
     with pytest.warns(UserWarning, match="does not have valid feature names"):
         model.predict_cov(X)
+
+
+def test_tables_of_pyarrow_are_read_and_equal_names_refused():
+    X, y = demonstrations(2)
+    table = pa.table({"time": X[:, 0]})
+    model = new("mixture").fit(table, pa.table({"x": y[:, 0], "y": y[:, 1]}))
+    np.testing.assert_array_equal(model.predict_cov(table), new("mixture").fit(X, y).predict_cov(X))
+    with pytest.raises(ValueError, match=r"X has several columns 'time', must have one of each name"):
+        new("mixture").fit(pd.DataFrame(np.hstack([X, X]), columns=["time", "time"]), y)
+    with pytest.raises(ValueError, match=r"table must have one column of each name: rename"):
+        Demonstrations.from_frame(pd.DataFrame(np.hstack([X, y, y]), columns=["time", "x", "y", "x", "y"]))
 
 
 @pytest.mark.parametrize("name", DEFAULTS)

@@ -99,6 +99,11 @@ def test_82_no_more_demonstrations_than_outputs_are_told_once(name, repeats):
     assert messages(regressor, X, rows[:, :2], groups) == []
 
 
+def test_82_one_demonstration_of_one_output_leaves_open_how_it_varies():
+    (message,) = messages(GMMBaseline(n_components=2), np.arange(10.0)[:, None], np.arange(10.0) ** 2, np.zeros(10))
+    assert message.startswith("y has one demonstration, which leaves open how")
+
+
 def test_82_regions_of_three_demonstrations_of_six_outputs_hold_what_they_say():
     """Of a hundred others, in the mean of four draws; the law of independent samples held .33 and .90."""
     held, before = [], []

@@ -59,7 +59,7 @@ WARNINGS = {
     (DataRankWarning, r"X has \d+ columns but varies in \d+ directions only"): "a length scale is not determined",
     (DataRankWarning, r"y has \d+ demonstrations at an input but"): "empirical covariances are singular, and shrunk",
     (DataRankWarning, r"y has \d+ (distinct )?rows but"): "too few rows in all",
-    (DataRankWarning, r"y has \d+ demonstrations but"): "too few demonstrations",
+    (DataRankWarning, r"y has (\d+ demonstrations but|one demonstration)"): "too few demonstrations",
     (DataRankWarning, r"X has rows so near to each other"): "a Wishart process cannot interpolate them",
     (UserWarning, r"X has \d+ values in column \d+ that differ from others by a rounding"): "two precisions",
     (DataRankWarning, r"y has means at the inputs that differ by more"): "a mean that would have to swing wildly",

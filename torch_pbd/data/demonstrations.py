@@ -248,7 +248,10 @@ class Demonstrations(Editing):
         import narwhals
 
         check_options(options, [name for name in OPTIONS if name != "max_bytes"], "frames")
-        rows = narwhals.from_native(table, eager_only=True, pass_through=True)
+        try:
+            rows = narwhals.from_native(table, eager_only=True, pass_through=True)
+        except narwhals.exceptions.DuplicateError as error:
+            raise InvalidParameterError(f"table must have one column of each name: rename. {error}") from error
         if not isinstance(rows, narwhals.DataFrame):
             must = "a dataframe of pandas, polars, pyarrow or alike, with its rows"
             raise checks.refusal(table, "table", must, "collect() lazy ones")

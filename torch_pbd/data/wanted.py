@@ -3,10 +3,9 @@
 import difflib
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields
-from decimal import Decimal
 from itertools import pairwise
-from numbers import Real
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
@@ -154,7 +153,7 @@ class Wanted:
                 if values.dtype.kind not in "biuf":
                     raise ValueError(f"column {name!r} holds {values.dtype}, no numbers: leave it out by outputs=.")
             positions.append(frozen(np.stack(columns, axis=1)))
-            times.append(_numbers(_column(signals, chosen.time)) if chosen.time else np.arange(len(columns[0])))
+            times.append(_column(signals, chosen.time) if chosen.time else np.arange(len(columns[0])))
             if hasattr(stamp := next(iter(times[-1]), None), "isoformat"):  # one of Python's
                 raise checks.refusal(stamp, "time", "a datetime64 or a number", "convert the column")
         given = {name: getattr(self, name) for name in ("units", "frame", "rotation", "angles", "time_unit")}
@@ -257,12 +256,11 @@ def _column(signals: Mapping[str, NDArray[Any]], place: tuple[str, int]) -> NDAr
 
 
 def _numbers(values: NDArray[Any]) -> NDArray[Any]:
-    """Values, but for objects that are numbers: these as NumPy's own, and None and NA as NaN."""
-    if values.dtype != object:
-        return values
-    known = [np.nan if value is None or repr(value) == "<NA>" else value for value in values]
-    known = [float(value) if isinstance(value, Decimal) else value for value in known]
-    return np.array(known) if all(isinstance(value, Real) for value in known) else values
+    """Values, and of objects that are numbers their floats, NaN where they are missing."""
+    if values.dtype == object:
+        with suppress(TypeError, ValueError):
+            return checks.real_floats(values, "it")
+    return values
 
 
 def _rows_of(demo: NDArray[Any], heads: NDArray[np.intp]) -> Sequence[slice | NDArray[np.intp]]:

@@ -39,7 +39,12 @@ def checked_values(values: Any, name: str) -> Any:
     if hasattr(values, "detach"):
         values = checks.from_tensor(values, name)
     if hasattr(values, "columns"):
-        for label in values.columns:
+        labels = list(getattr(values, "column_names", values.columns))  # pyarrow's columns are arrays
+        if twice := {label for label in labels if labels.count(label) > 1}:
+            raise ValueError(
+                f"{name} has several columns {min(twice)!r}, must have one of each name: rename the others."
+            )
+        for label in labels:
             _check_numbers(checks.real_array(values[label], f"column {label} of {name}"), f"{name}[{label!r}]")
     elif not issparse(values):  # scikit-learn has a better message for sparse matrices
         _check_numbers(checks.real_array(values, name), name)
@@ -217,7 +222,9 @@ def warn_if_few(
     elif groups is not None and (n_demos := int(groups.max()) + 1) <= n_outputs:  # whose samples repeat each other
         checks.warn(
             f"y has {n_demos} demonstrations but {n_outputs} outputs: they leave open how the outputs vary together. "
-            f"Record {n_outputs + 1} or more, or learn fewer outputs at a time.",
+            f"Record {n_outputs + 1} or more, or learn fewer outputs at a time."
+            if n_outputs > 1
+            else "y has one demonstration, which leaves open how demonstrations vary. Record two or more.",
             DataRankWarning,
         )
 

@@ -117,7 +117,10 @@ class MovementDisplay:
             if not (hasattr(model, "predict_cov") and hasattr(model, "log_likelihood")):
                 remedy = "of a controller take its covariance_"
                 raise checks.refusal(model, "estimator", "a covariance regressor or model of movements", remedy)
+        style.check_kind(demonstrations, "demonstrations", "Demonstrations")
         names = names or [type(model).__name__ for model in models]
+        if len(set(names)) != len(models):
+            raise checks.refusal(names, "names", f"{len(models)}, one for each model, and no two alike")
         checks.choice(input, "input", ("auto", "time", "phase"))
         of_model: Any = getattr(estimator, "input_", "time") if input == "auto" else input
         times = demonstrations.stack(of_model)[0]
@@ -126,6 +129,9 @@ class MovementDisplay:
         laws = {}
         for name, model in zip(names, models, strict=True):
             mean, covariance = model.predict(grid[:, np.newaxis], return_cov=True)
+            if covariance.shape[-1] != d:
+                must = f"with the {covariance.shape[-1]} outputs that {name} has learned, of {d}"
+                raise checks.refusal(demonstrations, "demonstrations", must, "take them by select()")
             laws[name] = np.reshape(mean, (-1, d)), covariance
         known = None if truth is None else truth(grid)
         return cls(demonstrations, grid, laws, truth=known, input=of_model, **options).plot(ax)

@@ -39,6 +39,8 @@ def plot_demonstrations(
     style.check_kind(demonstrations, "demonstrations", "Demonstrations")
     chosen = style.chosen_outputs(outputs, demonstrations.names, 3)
     style.check_axes("ax", [ax])
+    if len(chosen) == 3 and not hasattr(ax, "set_zlabel"):
+        raise checks.refusal(ax, "ax", "Axes of projection='3d' for three outputs", "or choose outputs=")
     lines: list[Line2D] = []
     for time, position in demonstrations:
         columns = position[:, chosen].T
