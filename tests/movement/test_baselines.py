@@ -14,7 +14,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import MinMaxScaler
 
 from movement.test_trajectory import GRID, gaussian_conditional, movements, stacked
-from torch_pbd import Demonstrations, KMPBaseline, ProMPBaseline, load_demonstrations
+from torch_pbd import Demonstrations, KMPBaseline, ProMPBaseline, TrajectoryRegressor, load_demonstrations
 from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.movement.promp import basis_functions
 
@@ -225,6 +225,14 @@ def test_baselines_have_the_methods_of_a_movement(make):
     np.testing.assert_array_equal(model.predict_uncertainty([[-0.1], [0.0], [1.0], [1.1]]).type1, [1.0, 0.0, 0.0, 1.0])
     assert clone(model).get_params() == model.get_params()
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(model)).predict(X), model.predict(X))
+
+
+@pytest.mark.parametrize("make", [TrajectoryRegressor, ProMPBaseline, KMPBaseline])
+def test_no_rows_have_a_law_and_draws_too(make):
+    model, none = fit(make(), movements(6)), np.empty((0, 1))
+    for law in (model, model.condition([[0.5]], [[0.1, np.nan]])):
+        assert [part.shape for part in law.predict_joint(none)] == [(0, 2), (0, 2, 0, 2)]
+        assert law.sample_demonstrations(none, 3).shape == (3, 0, 2)
 
 
 def test_promp_is_conditioned_by_the_normal_formulas():

@@ -21,6 +21,7 @@ from torch_pbd import (
     TrajectoryRegressor,
     load_demonstrations,
 )
+from torch_pbd.data import make_tunnel_demonstrations
 from torch_pbd.kernels import correlation
 from torch_pbd.movement import time_kernel_fit
 from torch_pbd.movement.time_kernel_fit import fit_time_kernel, smoothest_first
@@ -446,6 +447,11 @@ def test_parameters_are_checked(parameters, message):
     X, y, groups = stacked(movements())
     with pytest.raises(ValueError, match=message):
         TrajectoryRegressor(**parameters).fit(X, y, groups=groups)
+
+
+def test_demonstrations_are_no_rows_of_a_model_of_arrays(model):
+    with pytest.raises(ValueError, match="X is Demonstrations, but the fit was of arrays"):
+        model.score_demonstrations(make_tunnel_demonstrations(random_state=0))
 
 
 def test_what_is_known_twice_is_refused(model):

@@ -85,9 +85,9 @@ class JointNormal:
         # The inner part R - W W' + U U' first, and then a block of A on either side.
         n, d = self.mean.shape
         inner = torch.diag_embed(self._correlation.expand(d, n, n).permute(1, 2, 0)).transpose(1, 2)
-        flat = self.loadings.reshape(n * d, -1)
+        flat = self.loadings.flatten(0, 1)
         inner = inner + (flat @ flat.mT).reshape(n, d, n, d)
-        explained = self.explained.reshape(n * d, -1)
+        explained = self.explained.flatten(0, 1)
         whole = torch.einsum("iab,ibjc,jdc->iajd", self.factor, inner, self.factor)
         return symmetrize(whole.reshape(n * d, n * d) - explained @ explained.mT).reshape(n, d, n, d)
 

@@ -32,7 +32,7 @@ class KMPBaseline(MovementRegressor):
     ``k_t (K + lambda_mean S)^-1 mu`` and the covariance between t and t' is
     ``N / lambda_cov (k(t, t') I - k_t (K + lambda_cov S)^-1 k_t')``, of standardized outputs, since the kernel's
     variance is 1 and the mean returns to 0 far from the reference. Via points replace the nearest points of the
-    reference, as in the reference paper; this is not the law of a conditioned movement.
+    reference, as in the reference paper; this is not the law of a conditioned movement, and passes them nearly.
 
     Parameters
     ----------
@@ -111,10 +111,10 @@ class KMPBaseline(MovementRegressor):
         what = f"the covariance between {n} rows and {d} outputs"
         require_much(4 * 8.0 * (n * d) ** 2, what=what, remedy="Ask for fewer rows.")
         mean, whitened, level = self._through_reference(time)
-        explained = whitened.transpose(0, 2, 1).reshape(n * d, -1)
+        explained = whitened.transpose(0, 2, 1).reshape(n * d, whitened.shape[1])
         # Time by time, all outputs of each: the kernel of the times acts on each output separately.
         gram = np.kron(self._kernel(time, time), np.eye(d))
-        root = semidefinite_root(level * (gram - explained @ explained.T)).reshape(n, d, -1)
+        root = semidefinite_root(level * (gram - explained @ explained.T)).reshape(n, d, n * d)
         root *= self._scale[:, np.newaxis]
         return JointNormal.with_noise(*map(torch.from_numpy, (mean, root, np.sqrt(self.nugget) * self._scale)))
 

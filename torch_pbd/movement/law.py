@@ -211,6 +211,10 @@ def as_recordings(model: Any, X: Any, y: Any, groups: Any, *, is_fit: bool) -> l
         if y is not None or groups is not None:
             raise ValueError("y and groups must be None beside Demonstrations, which have both.")
         timed = getattr(model, "timing", "none") != "none"
+        if not is_fit and model.input_ == "array":
+            raise ValueError(
+                "X is Demonstrations, but the fit was of arrays: give X, y, groups as they were made there."
+            )
         if is_fit:
             model.input_ = "time" if timed or X.is_aligned else "phase"
             if X.alignment == "dtw":

@@ -80,7 +80,7 @@ def smooth_correlation(
     lengths, places = torch.unique(scales, return_inverse=True)
     apart = time[..., None] - other[..., None, :]
     each = correlation(apart.reshape(-1, 1), apart.new_zeros(1, 1), lengths[:, None], kernel)
-    each = each.reshape(-1, *apart.shape)
+    each = each.reshape(len(lengths), *apart.shape)
     slow = each[places[:, 0]]
     if not bool(fine.any()):
         return slow

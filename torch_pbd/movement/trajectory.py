@@ -123,7 +123,8 @@ class TrajectoryRegressor(TimedMovement):
     regressor_ : covariance regressor
         Regressor fitted to the rows.
     module_ : TrajectoryLaw
-        The fitted torch module: maps times (n, 1) to joint mean (n, d) and covariance (n, d, n, d), differentiably.
+        The fitted torch module: maps times (n, 1) to joint mean (n, d) and covariance (n, d, n, d), differentiably;
+        in a copy of :meth:`condition` too, of a movement of which nothing is known.
     time_kernel_ : str
     length_scale_ : ndarray of shape (n_outputs,)
         Length scale of each output's slow deviation along the movement, in units of X.
