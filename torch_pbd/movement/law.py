@@ -210,18 +210,7 @@ def as_recordings(model: Any, X: Any, y: Any, groups: Any, *, is_fit: bool) -> l
     if isinstance(X, Demonstrations):
         if y is not None or groups is not None:
             raise ValueError("y and groups must be None beside Demonstrations, which have both.")
-        timed = getattr(model, "timing", "none") != "none"
-        if not is_fit and model.input_ == "array":
-            raise ValueError(
-                "X is Demonstrations, but the fit was of arrays: give X, y, groups as they were made there."
-            )
-        if is_fit:
-            model.input_ = "time" if timed or X.is_aligned else "phase"
-            if X.alignment == "dtw":
-                checks.warn(TIMING_REMOVED)
-        shown, (X, y, groups) = X, X.stack(input="phase" if timed else model.input_)
-        if timed:  # demonstrations of different durations would otherwise be stacked over phase
-            X = np.concatenate(shown.from_start().times)[:, np.newaxis]
+        X, y, groups = _stacked(model, X, is_fit=is_fit)
     elif is_fit:
         model.input_ = "array"
         if groups is None:
@@ -243,6 +232,21 @@ def as_recordings(model: Any, X: Any, y: Any, groups: Any, *, is_fit: bool) -> l
     order = np.lexsort([inputs[:, 0], numbers])
     parts = np.split(order, np.flatnonzero(np.diff(numbers[order])) + 1)
     return [Demonstration(inputs[rows, 0], targets[rows].reshape(len(rows), -1)) for rows in parts]
+
+
+def _stacked(model: Any, shown: Demonstrations, *, is_fit: bool) -> tuple[Floats, Floats, NDArray[np.intp]]:
+    """Rows over the kind of input of the fit, which a fit sets."""
+    timed = getattr(model, "timing", "none") != "none"
+    if is_fit:
+        model.input_ = "time" if timed or shown.is_aligned else "phase"
+        if shown.alignment == "dtw":
+            checks.warn(TIMING_REMOVED)
+    elif model.input_ == "array":
+        raise ValueError("X is Demonstrations, but the fit was of arrays: give X, y, groups as they were made for it.")
+    X, y, groups = shown.stack(input="phase" if timed else model.input_)
+    if timed:  # demonstrations of different durations would otherwise be stacked over phase
+        X = np.concatenate(shown.from_start().times)[:, np.newaxis]
+    return X, y, groups
 
 
 def as_rows(recordings: list[Demonstration]) -> tuple[Floats, Floats, NDArray[np.intp]]:
