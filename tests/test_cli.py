@@ -4,6 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import yaml
@@ -19,6 +20,12 @@ def recording(tmp_path):
     path = tmp_path / "recording.csv"
     torch_pbd.save_demonstrations(make_tunnel_demonstrations(5, rate=4.0, random_state=0), path)
     return path
+
+
+@pytest.fixture
+def empty_figures(monkeypatch):
+    """Figures take most of the time of a short run."""
+    monkeypatch.setattr("torch_pbd.experiments.comparison.figure_of", lambda *_: plt.figure())
 
 
 @pytest.mark.parametrize(
@@ -70,6 +77,7 @@ def test_models_have_the_names_that_tables_print(name, found, capsys):
     assert shown.get("init_args", {}).get("n_components") == (8 if name == "GMM 8" else None)
 
 
+@pytest.mark.usefixtures("empty_figures")
 def test_where_one_of_two_is_left_out_models_of_movements_are_not_compared(tmp_path, capsys):
     path = tmp_path / "two.csv"
     torch_pbd.save_demonstrations(make_tunnel_demonstrations(2, rate=4.0, random_state=0), path)
@@ -115,6 +123,7 @@ def test_a_controller_of_a_config_bends_by_a_model_of_movements(recording, tmp_p
     np.testing.assert_allclose(schedule.position[500], point, atol=1e-6)
 
 
+@pytest.mark.usefixtures("empty_figures")
 def test_compare_reports_every_model_and_every_fold(recording, tmp_path, capsys):
     config = tmp_path / "compare.yaml"
     config.write_text(

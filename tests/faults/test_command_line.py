@@ -10,6 +10,7 @@ import sys
 from itertools import product
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import pytest
 
 import torch_pbd
@@ -18,6 +19,12 @@ from torch_pbd.cli.main import main
 
 COMMAND = [sys.executable, "-m", "torch_pbd.cli.main"]
 GMM = ["--model", "GMMBaseline", "--model.n_components", "2"]
+
+
+@pytest.fixture(autouse=True)
+def empty_figures(monkeypatch):
+    """Figures take most of the time of a short run; those of other processes are drawn."""
+    monkeypatch.setattr("torch_pbd.experiments.comparison.figure_of", lambda *_: plt.figure())
 
 
 def refused(data, output, capsys):
