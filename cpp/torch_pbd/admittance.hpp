@@ -42,7 +42,7 @@ struct Options {
     Limit velocity_limit{infinity, infinity};  ///< of the command, in units/s and rad/s
     Limit acceleration_limit{infinity, infinity};  ///< of the command, in units/s^2 and rad/s^2
     int hold_ticks = 10;  ///< ticks on end with a force that is not finite before the robot stops
-    int max_bad_ticks = 10;  ///< ticks on end with a time that is wrong before the robot stops
+    int max_bad_ticks = 10;  ///< ticks with a time that is wrong before the robot stops, but for one in ten good ones
     std::optional<Limit> stop_deceleration;  ///< of a stop, in units/s^2 and rad/s^2
     double soft_start = 1.0;  ///< time of the approach to the schedule at `start`, in s
     Limit approach_speed{0.5, 1.0};  ///< largest speed of the approach, in units/s and rad/s
@@ -125,7 +125,7 @@ public:
         last_ = newest_ = now;
         step_ = 1.0 / rate_;
         is_regular_ = false;
-        n_bad_ = n_late_ = 0;
+        n_bad_ = n_late_ = 0.0;
         channel_.begin(from.force_bias);
         scale_ = {1.0, 1.0};
         desired_ = clock_.begin(now, from.at, from.position, orientation, from.velocity, state_.place);
@@ -185,6 +185,7 @@ private:
     static constexpr double kSmoothing = 0.1;
     // A reading must tell ticks apart to 1 %, which of their length is rounding: times since 1970 in s do, in ns not.
     static constexpr double kCoarse = 0.01;
+    static constexpr double kMadeUp = 0.1;  // share of a bad or late tick that a good one makes up for
     static constexpr int kLateOnEnd = 3;  // one late tick is a stall, two may be; three are a loop that is too slow
     static constexpr double kOff = 1e-3;  // of a quaternion's length: four rounded digits
 
@@ -244,6 +245,9 @@ private:
     /// Fault of a tick that is not like the last one.
     Faults read(double now) {
         if (is_regular_) {
+            const double made_up = kMadeUp * (last_ - newest_) / step_;
+            n_bad_ = std::max(0.0, n_bad_ - made_up);
+            n_late_ = std::max(0.0, n_late_ - made_up);
             is_regular_ = false;
             newest_ = last_;
         }
@@ -252,18 +256,16 @@ private:
             return kClock;
         }
         // The clock has lost what bad ticks have lived through.
-        if (n_bad_ && now < last_ + 0.5 * step_) {
+        if (newest_ < last_ && now < last_ + 0.5 * step_) {
             clock_.shift(now - step_ - last_);
             last_ = now - step_;
         }
         newest_ = now;
-        n_bad_ = 0;
         if (now - last_ > longest_) {
             ++n_late_;
             return kLate;
         }
         is_regular_ = true;
-        n_late_ = 0;
         return 0;
     }
 
@@ -290,7 +292,7 @@ private:
     State<N, M> state_{}, desired_{};
     double last_ = std::numeric_limits<double>::quiet_NaN();  ///< until when the motion is known
     double newest_ = 0.0, step_ = 0.0;  ///< reading of the clock, and how long ticks last
-    int n_bad_ = 0, n_late_ = 0;
+    double n_bad_ = 0.0, n_late_ = 0.0;
     bool is_started_ = false, is_stopped_ = false, is_regular_ = false;
     Faults faults_ = 0;
 };

@@ -172,6 +172,15 @@ def test_a_loop_that_is_too_slow_stops(tmp_path):
     assert not any(both.tick(0.01 * i, [1.0]) for i in range(1, 100))  # as long as may be, but for rounding
 
 
+@pytest.mark.parametrize("steps", [[0.0, 0.001], [0.0, *[0.001] * 9], [0.011, 0.001], [0.011, *[0.001] * 9]])
+def test_a_loop_that_never_gets_going_stops_at_the_same_tick(steps, tmp_path):
+    both = Both(make_schedule(1, duration=3.0), tmp_path)
+    both.start(0.0)
+    for now in np.cumsum(np.tile(steps, 1000 // len(steps))):
+        both.tick(now, [1.0])
+    assert both.seen & TickStatus.STOPPED
+
+
 def test_before_start_it_stands(tmp_path):
     cpp = Both(constant(100.0, 10.0), tmp_path).cpp
     assert cpp.tick(0.001, [1.0]) == TickStatus.STOPPED

@@ -231,6 +231,23 @@ def test_75_a_clock_that_steps_back_by_some_ticks_is_bridged(back):
     np.testing.assert_allclose(velocities[-100:], SPEED, rtol=1e-3)
 
 
+@pytest.mark.parametrize(("every", "stops"), [(2, True), (10, True), (20, False), (50, False)])
+def test_75_a_clock_that_repeats_stamps_until_the_robot_stands_stops_it(every, stops):
+    controller = RealTimeAdmittance(cut())
+    controller.start(0.0)
+    went(controller, [(i - (i % every == 0)) / 1000 for i in range(1, 2001)])
+    assert controller.faults == TickStatus.CLOCK | TickStatus.STOPPED * stops
+    assert (controller.schedule_time > 0.5) == (not stops)
+
+
+@pytest.mark.parametrize(("good", "stops"), [(1, True), (9, True), (11, False)])
+def test_79_a_loop_that_is_late_until_the_robot_stands_stops_it(good, stops):
+    controller = RealTimeAdmittance(cut())
+    controller.start(0.0)
+    went(controller, np.cumsum(np.tile([0.011, *[0.001] * good], 100)))
+    assert controller.faults == TickStatus.LATE | TickStatus.STOPPED * stops
+
+
 def test_76_a_spike_before_a_loss_is_not_held():
     controller = one_axis()
     controller.start(0.0)

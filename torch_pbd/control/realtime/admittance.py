@@ -58,7 +58,7 @@ class RealTimeAdmittance:
         than the schedule's raises a warning.
     rate, max_step : float, default=1000.0, 0.01
         Rate of the loop in Hz and longest tick in s. Over a longer tick the robot brakes, or rests at its last command
-        if there was time to return to it; after three consecutive ones it stops.
+        if there was time to return to it; after three it stops, unless ten good ticks for each made up for them.
     force_limit, deadband : float or (float, float), default=None
         Largest norm of the force, the range of the sensor; and soft threshold of the force per axis, against drift and
         noise. None is 200 N and 20 Nm, and no deadband.
@@ -71,8 +71,9 @@ class RealTimeAdmittance:
         Largest speed and acceleration of the command; where they act, ticks are not exact. None is the most that the
         desired motion and ``force_limit`` can cause where the damping is smallest.
     hold_ticks, max_bad_ticks : int, default=10
-        Consecutive ticks with a non-finite force, or with a non-finite or non-increasing time, before the robot stops.
-        Until then the median of the last five good forces acts, fading to zero, or the robot brakes.
+        Consecutive ticks with a non-finite force, and ticks with a non-finite or non-increasing time, of which ten good
+        ones make up for one, before the robot stops. Until then the median of the last five good forces acts, fading to
+        zero, or the robot brakes.
     stop_deceleration : float or (float, float), default=None
         Deceleration of a stop and at invalid times, within ``acceleration_limit``. None is 5 units/s^2 and 10 rad/s^2,
         or the largest acceleration of the desired motion if that is more.
