@@ -153,6 +153,11 @@ def test_pushes_on_a_pose_are_drawn_in_the_units_of_each_block():
     assert {text.get_text() for text in run.plot()[0].figure.legends[0].get_texts()} >= {"force x", "torque z"}
 
 
+def test_names_of_a_run_are_as_many_as_its_outputs(run):
+    with pytest.raises(ValueError, match=r"names is \['a'\], must be 2, one for each output"):
+        run[1].plot(names=["a"])
+
+
 def test_a_batch_of_runs_is_refused(run):
     _, pushed, _ = run
     batch = replace(pushed, position=np.stack([pushed.position] * 3))

@@ -94,3 +94,5 @@ def test_a_dropped_file_is_read_whatever_its_name(learned):
     np.testing.assert_allclose(np.array(strokes[2])[:, 1:], learned.strokes.positions[2], atol=1e-9)
     with pytest.raises(ValueError, match="2"):
         learning.read_file("a.csv", b"demo,time,x,y,z\n0,0,1,2,3\n0,1,1,2,3\n0,2,1,2,4\n")
+    with pytest.raises(ValueError, match=r"^b\.npz: it is not a sound"):
+        learning.read_file("b.npz", b"no archive")

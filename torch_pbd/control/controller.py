@@ -65,7 +65,7 @@ class DMPController(Planning):
         Cutoff frequency in Hz, at which amplitudes are halved, of the smoothing before differentiation. "auto" is 40
         cycles per movement, at least 4 Hz; None does not smooth.
     duration : float, default=None
-        Duration of the movement in s; None is the median of the demonstrations. Required if their times are phases.
+        Duration of the movement in s; None is the median of the demonstrations, of whose phases 1 would count as 1 s.
     n_steps : int, default=100
         Number of points along the movement at which forcing and variability are learned.
     stiffness_law : StiffnessLaw, default=None
@@ -141,7 +141,7 @@ class DMPController(Planning):
         Parameters
         ----------
         X : Demonstrations, or array-like of shape (n_samples, 1)
-            Demonstrations, or sample times in s that increase within each demonstration; phases need ``duration``.
+            Demonstrations, or sample times in s that increase within each demonstration; with phases give ``duration``.
         y : array-like of shape (n_samples, n_outputs), default=None
             Positions at these times, in m. Arrays have neither units nor rotations, which Demonstrations do: the
             rotations that ``stack()`` gives for poses would count rad as m; tables with such columns raise an error.

@@ -134,11 +134,14 @@ def take_home(learned: Learned, name: str) -> bytes:
 
 
 def read_file(name: str, content: bytes) -> list[list[list[float]]]:
-    """Strokes of a file of demonstrations, .csv or .npz, of two outputs; its name is used for its ending alone."""
+    """Strokes of a file of demonstrations, .csv or .npz, of two outputs; of its name only the ending counts."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, f"dropped{Path(name).suffix.lower()}")
         path.write_bytes(content)
-        demonstrations = load_demonstrations(path)
+        try:
+            demonstrations = load_demonstrations(path)
+        except ValueError as error:
+            raise ValueError(str(error).replace(str(path), name)) from None
     if demonstrations.n_outputs != 2:
         raise ValueError(f"{name} has {demonstrations.n_outputs} outputs, must have 2: leave the others out.")
     return [np.column_stack(each).tolist() for each in demonstrations.from_start()]

@@ -236,6 +236,8 @@ def plot_rollout(
     p, d = rollout.position.shape[-1], rollout.velocity.shape[-1]
     style.check_axes("axes", axes, 3 if p == d else 6)
     names = names or (style.POSE_NAMES if d == p + 3 == 6 else [f"y{i}" for i in range(d)])
+    if len(names) != d:
+        raise checks.refusal(names, "names", f"{d}, one for each output")
     chosen = style.chosen_outputs(outputs, names, 6)
     for i, block in enumerate((slice(0, p), slice(p, d))[: 1 + (d > p)]):
         kind, (above, middle, below) = style.kind_of(rollout.units, block), axes[3 * i : 3 * i + 3]
