@@ -135,7 +135,9 @@ def test_compare_reports_every_model_and_every_fold(recording, tmp_path, capsys)
     )
     assert main(["compare", "--config", str(config)]) == 0
     shown = capsys.readouterr().out
-    assert "held-out LL" in shown
+    for best in ("held-out LL", "joint LL"):
+        assert any(f"\nbest {best}: {name}, " in shown for name in ("mine", "mixture", "whole"))
+    assert "error to truth" not in shown  # which is not known of recordings
     assert max(map(len, shown[: shown.index("report:")].splitlines())) <= 80
     with (tmp_path / "out" / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -146,6 +148,15 @@ def test_compare_reports_every_model_and_every_fold(recording, tmp_path, capsys)
     folds = [float(rows[0][f"LL {i}"]) for i in (1, 2, 3)]
     assert float(rows[0]["held-out LL"]) == pytest.approx(np.mean(folds))
     assert torch_pbd.load(tmp_path / "out" / "model" / "mine.safetensors").noise_scale == 1e-4
+
+
+def test_without_folds_the_legend_is_of_the_fit_alone(recording, tmp_path, capsys):
+    arguments = ["--data", str(recording), "--models", "{A: GMM 5, B: GMM 8}", "--output", str(tmp_path / "out")]
+    assert main(["compare", *arguments, "--max_folds", "0"]) == 0
+    shown = capsys.readouterr().out
+    assert "least eig.: smallest" in shown
+    assert "MSE: squared" in shown
+    assert not {"best", "held-out", "joint", "left-out"} & set(shown.split("report:")[0].split())
 
 
 def test_compare_without_data_is_table_1(tmp_path, capsys):

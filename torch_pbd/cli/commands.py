@@ -93,23 +93,6 @@ OPTIONS: dict[str, dict[str, Option]] = {
     },
 }  # fmt: skip
 
-_LEGEND = """MSE: squared distance of Cholesky factors to the empirical covariances, units of
-the data (Table I); error to truth: relative Frobenius error of the covariance;"""
-_FOLDS_LEGEND = f"""{_LEGEND}
-held-out LL: log-likelihood of left-out demonstrations, nats per sample, its
-mean +- standard error and its median over the folds; 95 % holds: share of
-left-out samples in the 95 % ellipse; least eig.: smallest eigenvalue of the
-predicted correlations
-
-joint LL: log-likelihood of left-out demonstrations as a whole, nats each, of
-regressors as if samples were independent; deviation, offset, length, largest:
-share of these movements in the central 90 % of draws, of the mean squared
-deviation, the time-averaged offset, the path length, the largest deviation"""
-_DEMO_LEGEND = f"""{_LEGEND}
-fresh LL: log-likelihood of the fresh demonstrations, nats per sample;
-95 % of fresh: share of their samples in the 95 % ellipse; least eig.: smallest
-eigenvalue of the predicted correlations"""
-
 
 def parse(command: str, arguments: Sequence[str]) -> tuple[Namespace, str]:
     """Options of a command, and the YAML that gives them again."""
@@ -140,7 +123,7 @@ def demo(options: Any, folder: Any) -> str:
     say(f"{options.n_demos} made demonstrations of the tunnel task; the truth is that of 300 fresh ones\n")
     compared = parse("compare", [])[0].models
     models = {name: compared[name] for name in ("HGP", "CD", "WP", "GMM 5")}
-    return f"{run_demo(models, folder, n_demos=options.n_demos, seed=options.seed)}\n\n{_DEMO_LEGEND}"
+    return run_demo(models, folder, n_demos=options.n_demos, seed=options.seed)
 
 
 def fit(options: Any, folder: Any) -> str:
@@ -224,7 +207,7 @@ def compare(options: Any, folder: Any) -> str:
         models = options.models
         if len(demonstrations) == 2:
             models = _of_rows(models, "one left out leaves one, and how whole movements differ is not seen in one")
-        return f"{run_recordings(models, demonstrations, folder, options.input, **how)}\n\n{_FOLDS_LEGEND}"
+        return run_recordings(models, demonstrations, folder, options.input, **how)
     from torch_pbd.experiments.simulation import run_simulation
 
     models = _of_rows(options.models, "the simulation draws at each input anew: give --data FILE")

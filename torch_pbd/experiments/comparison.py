@@ -1,7 +1,8 @@
 """Comparison of models on one data set or on recordings: fit to the data, and prediction of a demonstration."""
 
+import textwrap
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -22,9 +23,26 @@ from torch_pbd.plotting import style
 Align = Literal["auto", "none", "phase", "dtw"]
 Input = Literal["time", "phase"]
 
+_WIDTH = 80  # of lines, as of tables
 _N_DRAWS = 500  # of a model's movements, of which 25 are beyond each end of the central 90 %
 MOVEMENT_STATISTICS = ("deviation", "offset", "length", "largest")
 """Statistics of whole movements, of :func:`movement_statistics`."""
+_LEGEND = {
+    "MSE": "squared distance of Cholesky factors to the empirical covariances, units of the data (Table I)",
+    "error to truth": "relative Frobenius error of the covariance",
+    "fresh LL": "log-likelihood of the fresh demonstrations, nats per sample",
+    "95 % of fresh": "share of their samples in the 95 % ellipse",
+    "held-out LL": "log-likelihood of left-out demonstrations, nats per sample, its mean +- standard error and its "
+    "median over the folds",
+    "95 % holds": "share of left-out samples in the 95 % ellipse",
+    "least eig.": "smallest eigenvalue of the predicted correlations",
+    "joint LL": "log-likelihood of left-out demonstrations as a whole, nats each, of regressors as if samples were "
+    "independent",
+    "deviation": "share of these movements with a mean squared deviation in the central 90 % of draws",
+    "offset": "the same of the time-averaged offset",
+    "length": "of the path length",
+    "largest": "of the largest deviation",
+}
 
 
 class Score(NamedTuple):
@@ -159,6 +177,18 @@ def judge_movement(model: Any, X: ArrayLike, y: ArrayLike) -> dict[str, float]:
     return {"joint": joint} | dict(zip(MOVEMENT_STATISTICS, ((low <= own) & (own <= high)).astype(float), strict=True))
 
 
+def explained(rows: Sequence[Mapping[str, Any]], best: str) -> str:
+    """Table of models, the one of the largest ``best`` with its margin, and a legend of the columns shown."""
+    shown = [name for name in rows[0] if any(row[name] == row[name] for row in rows)]
+    ranked = sorted((row for row in rows if row[best] == row[best]), key=lambda row: -row[best])
+    parts = [format_table(rows)]
+    if len(ranked) > 1:
+        margin = f"{ranked[0][best] - ranked[1][best]:.2f} above {ranked[1]['model']}"
+        parts.append(f"best {best}: {ranked[0]['model']}, {margin}")
+    legend = "; ".join(f"{name}: {_LEGEND[name]}" for name in shown if name in _LEGEND)
+    return "\n\n".join([*parts, textwrap.fill(legend, _WIDTH)])
+
+
 def empirical_covariances(X: Floats, y: Floats) -> tuple[Floats, Floats | None]:
     """Distinct rows of X, and the covariance of y at each (divisor K - 1), or None if a row is alone."""
     inputs, index, counts = np.unique(X, axis=0, return_inverse=True, return_counts=True)
@@ -240,4 +270,5 @@ def run_recordings(
     for name, score in scores.items():
         folder.write_fitted(name, score.fitted, figure_of(score.fitted, demonstrations, name, input))
     rows = [score.row for score in scores.values()]
-    return "\n\n".join(map(format_table, [rows, whole] if metrics[0]["folds"] else [rows]))
+    movements = [explained(whole, "joint LL")] if metrics[0]["folds"] else []
+    return "\n\n".join([explained(rows, "held-out LL"), *movements])

@@ -14,7 +14,7 @@ from torch_pbd.control.controller import DMPController
 from torch_pbd.data import Demonstrations, make_tunnel_demonstrations, save_demonstrations
 from torch_pbd.data.synthetic import Reading, make_paper_simulation, paper_covariance, paper_mean
 from torch_pbd.estimators.base import CovarianceRegressor
-from torch_pbd.experiments.comparison import compare_models, empirical_covariances, figure_of
+from torch_pbd.experiments.comparison import compare_models, empirical_covariances, explained, figure_of
 from torch_pbd.experiments.robot import draw_tunnel, run_robot
 from torch_pbd.experiments.run_folder import RunFolder
 from torch_pbd.metrics import mahalanobis_coverage
@@ -117,7 +117,7 @@ def run_demo(models: Mapping[str, CovarianceRegressor], folder: RunFolder, *, n_
     name, model = next(iter(models.items()))
     title = "A robot under its control, pushed with 5 N along x at 2 s and 8 s:\ndisplacement, and stiffness in N/m"
     pushed = run_robot({name: DMPController(model)}, demonstrations, folder, in_tunnel=True, metrics="pushes")
-    return "\n\n".join([format_table(rows), title, pushed])
+    return "\n\n".join([explained(rows, "fresh LL"), title, pushed])
 
 
 def _tunnel_figure(models: Mapping[str, CovarianceRegressor], demonstrations: Demonstrations) -> Figure:
