@@ -183,6 +183,14 @@ def test_compare_without_data_is_table_1(tmp_path, capsys):
         ),
         (["fit", "--data", "x.npz", "--model", "GMMBaseline", "--model.tol", "soon"], "soon"),
         (["fit", "--data", "x.npz", "--model", "KMPBaseline", "--model.regressor", "ProMPBaseline"], "not a class"),
+        (
+            ["fit", "--data", "x.npz", "--n_steps", "1"],
+            "--n_steps is the number 1, must be a whole number of at least 2",
+        ),
+        (
+            ["fit", "--data", "x.npz", "--model", "CD", "--model.noise_scale", "-1"],
+            "model: noise_scale is -1.0, must be",
+        ),
         (["compare", "--models", '{"mine": "ProMPBaseline"}'], "models: there are only such of whole movements"),
         (
             [

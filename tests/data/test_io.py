@@ -87,6 +87,11 @@ def test_paths_and_options_are_checked(tmp_path):
         load_demonstrations(tmp_path / "set.doc")
     with pytest.raises(FileNotFoundError, match=r"set\.npz"):
         load_demonstrations(tmp_path / "set.npz")
+    with pytest.raises(ValueError, match=r"source is '', must be a path"):
+        load_demonstrations("")
+    (tmp_path / "set.csv").write_text("time,x\n0,1\n1,2\n")
+    with pytest.raises(ValueError, match=r"source is .*must be of different files: name each once"):
+        load_demonstrations([tmp_path / "set.csv", str(tmp_path / "*.csv")])
     with pytest.raises(FileNotFoundError, match=r"the folder .*missing does not exist"):
         save_demonstrations(sets()["ragged"], tmp_path / "missing" / "set.csv")
     with pytest.raises(TypeError, match=r"have no option 'sep'; they have: outputs, demo, time, .*delimiter"):

@@ -40,7 +40,7 @@ _FILE = {
 _GRID = {
     "align": Option(Literal["auto", "none", "phase", "dtw"], "auto", "auto: by phase where sampling times differ"),
     "input": Option(Literal["time", "phase"], "time", "what the covariance depends on"),
-    "n_steps": Option(_Count | None, None, "number of points to resample to"),
+    "n_steps": Option(Annotated[int, (2, math.inf)] | None, None, "number of points to resample to"),
 }
 _CLASS_HELP = "by name, or class_path and init_args; see"
 _RECORDED = {**_FILE, "data": Option(str | list[str] | None, None, _DATA, required=True)}

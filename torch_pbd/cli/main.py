@@ -96,6 +96,12 @@ def _run(arguments: Sequence[str]) -> None:
 def _work(command: str, options: Any, config: str) -> None:
     from torch_pbd.experiments.run_folder import check_names, write_report
 
+    own = getattr(options, "models", None) or getattr(options, "controllers", None) or {}
+    for name, model in ({"model": options.model} if hasattr(options, "model") else own).items():
+        try:
+            model._check_parameters()  # as its fit does, once data are loaded
+        except (TypeError, ValueError) as error:
+            raise ConfigError(f"{name}: {error}") from error
     if getattr(options, "data", None) is not None:
         options.data = _files(options.data)
     for argument in ("models", "controllers"):

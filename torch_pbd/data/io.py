@@ -127,10 +127,13 @@ def inspect_demonstrations(source: Source, **options: Any) -> tuple[Demonstratio
 
 def find_files(source: Source) -> list[Path]:
     """Files of a source, or folders that are one recording; a FileNotFoundError if there are none."""
+    if not source:
+        raise checks.refusal(source, "source", "a path, or a list of some", "'.' is this folder")
     if isinstance(source, Sequence) and not isinstance(source, str):
-        if not source:
-            raise checks.refusal(source, "source", "a path, or a list of some")
-        return [file for entry in source for file in find_files(entry)]
+        files = [file for entry in source for file in find_files(entry)]
+        if len({file.resolve() for file in files}) < len(files):
+            raise checks.refusal([*map(str, files)], "source", "of different files", "name each once")
+        return files
     path = Path(source)
     if any(mark in path.name for mark in "*?[") and not path.exists():
         within = list(path.parent.glob(path.name))
