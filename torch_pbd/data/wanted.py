@@ -3,7 +3,6 @@
 import difflib
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import Any, Literal, NamedTuple, TypeVar
@@ -148,10 +147,7 @@ class Wanted:
                 if n != widths.setdefault(name, n):
                     must = f"must have {widths[name]} as that of the first: select others by outputs=, or mend the file"
                     raise ValueError(f"array {name!r} of demonstration {k} has {n} columns, {must}.")
-            columns = [_numbers(_column(signals, place)) for place in chosen.outputs]
-            for name, values in zip(chosen.names, columns, strict=True):
-                if values.dtype.kind not in "biuf":
-                    raise ValueError(f"column {name!r} holds {values.dtype}, no numbers: leave it out by outputs=.")
+            columns = [_numbers(signals, *one) for one in zip(chosen.outputs, chosen.names, strict=True)]
             positions.append(frozen(np.stack(columns, axis=1)))
             times.append(_column(signals, chosen.time) if chosen.time else np.arange(len(columns[0])))
             if hasattr(stamp := next(iter(times[-1]), None), "isoformat"):  # one of Python's
@@ -255,12 +251,13 @@ def _column(signals: Mapping[str, NDArray[Any]], place: tuple[str, int]) -> NDAr
     return values if values.ndim == 1 else values[:, place[1]]
 
 
-def _numbers(values: NDArray[Any]) -> NDArray[Any]:
-    """Values, and of objects that are numbers their floats, NaN where they are missing."""
-    if values.dtype == object:
-        with suppress(TypeError, ValueError):
-            return checks.real_floats(values, "it")
-    return values
+def _numbers(signals: Mapping[str, NDArray[Any]], place: tuple[str, int], name: str) -> NDArray[Any]:
+    """Column of numbers; of objects that are numbers their floats, NaN where they are missing."""
+    values = _column(signals, place)
+    try:
+        return values if values.dtype.kind in "biuf" else checks.real_floats(values, name)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"column {name!r} holds {values.dtype}, no numbers: leave it out by outputs=.") from error
 
 
 def _rows_of(demo: NDArray[Any], heads: NDArray[np.intp]) -> Sequence[slice | NDArray[np.intp]]:

@@ -23,7 +23,6 @@ from torch_pbd.plotting import style
 Align = Literal["auto", "none", "phase", "dtw"]
 Input = Literal["time", "phase"]
 
-_WIDTH = 80  # of lines, as of tables
 _N_DRAWS = 500  # of a model's movements, of which 25 are beyond each end of the central 90 %
 MOVEMENT_STATISTICS = ("deviation", "offset", "length", "largest")
 """Statistics of whole movements, of :func:`movement_statistics`."""
@@ -181,12 +180,11 @@ def explained(rows: Sequence[Mapping[str, Any]], best: str) -> str:
     """Table of models, the one of the largest ``best`` with its margin, and a legend of the columns shown."""
     shown = [name for name in rows[0] if any(row[name] == row[name] for row in rows)]
     ranked = sorted((row for row in rows if row[best] == row[best]), key=lambda row: -row[best])
-    parts = [format_table(rows)]
+    parts = [format_table(rows), textwrap.fill("; ".join(f"{n}: {_LEGEND[n]}" for n in shown if n in _LEGEND), 80)]
     if len(ranked) > 1:
-        margin = f"{ranked[0][best] - ranked[1][best]:.2f} above {ranked[1]['model']}"
-        parts.append(f"best {best}: {ranked[0]['model']}, {margin}")
-    legend = "; ".join(f"{name}: {_LEGEND[name]}" for name in shown if name in _LEGEND)
-    return "\n\n".join([*parts, textwrap.fill(legend, _WIDTH)])
+        margin = ranked[0][best] - ranked[1][best]
+        parts.insert(1, f"best {best}: {ranked[0]['model']}, {margin:.2f} above {ranked[1]['model']}")
+    return "\n\n".join(parts)
 
 
 def empirical_covariances(X: Floats, y: Floats) -> tuple[Floats, Floats | None]:

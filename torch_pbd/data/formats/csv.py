@@ -71,9 +71,7 @@ class _Table:
             # A mark that is not the delimiter finds one column, or cuts names that hold it.
             sought = {wanted.demo, wanted.time or "time", *(wanted.outputs or ())}
             self.header = max(headers, key=lambda names: (len(sought & set(names)), len(names)))
-            if self.header and all(
-                _is_number(name) or _CLOCK.fullmatch(name) or name.lower() in _MISSING for name in self.header
-            ):
+            if self.header and all(_is_number(name) or _CLOCK.fullmatch(name) for name in self.header):
                 raise ValueError(f"it must name the columns, and has numbers: {preview(self.header)}.")
             if len(self.header) == 1 and wanted.rate is None:
                 what = f"no columns but one, {self.header[0]!r:.80}, by {candidates} and the decimal mark {decimal!r}"
