@@ -29,7 +29,7 @@ from torch_pbd.gp.observations import (
     spacing,
 )
 from torch_pbd.gp.search import Found, Job, fit_together
-from torch_pbd.kernels import KERNELS, KernelName
+from torch_pbd.kernels import KERNELS, KernelName, default_length_scale
 from torch_pbd.models.conditional import MeanAndCovariance
 from torch_pbd.models.costs import LatentValues, Likelihood, Solver, train
 from torch_pbd.models.links import Link
@@ -44,8 +44,6 @@ _LEVEL = 1e-4  # significance level of the lack-of-fit tests: how often a right 
 _CLEAR = 5.0  # standard errors that always reject a mean: with two rows at two inputs the t test would allow 100
 _LEAST_SPREAD = 0.03  # smallest credible spread at one input, as a share of the pooled spread
 _UNRESOLVED = 1e-10  # squared error in standardized outputs that a smooth process may always have
-# Rows for each function of a default length scale, and its longest, in ranges of one input.
-_ROWS_OF_A_FUNCTION, _LONGEST_OF_FEW = 40.0, 1.0
 _SPREAD = 0.01  # standard deviation of the random part of whitened values at the start
 _SHARE, _LEAST_NOISE = 0.1, 1e-6  # noise of a mean: share of its smallest error, and least share of the outputs' scale
 
@@ -249,15 +247,9 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         training, length_scale = problem.training, problem.length_scale
         n_inputs, n_features = training.inputs.shape
         if length_scale is None:
-            shortest = 0.2 * n_features**0.5
-            if self.latent_prior:
-                # So many rows for each of the (1 + 0.8 / l)^e functions of length scale l, or the likeliest values
-                # explain each row by itself: of 120 rows of three inputs fresh ones lost 1e9 nats.
-                n_functions = max(1.001, len(residual) / _ROWS_OF_A_FUNCTION) ** (1.0 / n_features)
-                shortest = max(shortest, min(0.8 / (n_functions - 1.0), _LONGEST_OF_FEW * n_features**0.5))
-            if n_features == 1:
-                shortest = min(shortest, longest_within(training.inputs))
-            length_scale = training.inputs.new_full((n_features,), shortest)
+            length = default_length_scale(n_features, len(residual) if self.latent_prior else None)
+            length = min(length, longest_within(training.inputs)) if n_features == 1 else length
+            length_scale = training.inputs.new_full((n_features,), length)
         deviation = link.deviation(start).expand(n_inputs, -1).mT.contiguous()
         options: Any = {"kernel": self.kernel, "train_hyperparameters": not self.latent_prior}
         latent = LatentValues(training.inputs, deviation, link.amplitude(), length_scale[None], **options)

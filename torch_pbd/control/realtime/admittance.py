@@ -71,9 +71,8 @@ class RealTimeAdmittance:
         Largest speed and acceleration of the command; where they act, ticks are not exact. None is the most that the
         desired motion and ``force_limit`` can cause where the damping is smallest.
     hold_ticks, max_bad_ticks : int, default=10
-        Consecutive ticks with a non-finite force, and ticks with a non-finite or non-increasing time, of which ten good
-        ones make up for one, before the robot stops. Until then the median of the last five good forces acts, fading to
-        zero, or the robot brakes.
+        Consecutive ticks with a non-finite force, or ticks with an invalid time (ten good ones make up for one), before
+        the robot stops. Until then the median of the last five good forces acts, fading to zero, or the robot brakes.
     stop_deceleration : float or (float, float), default=None
         Deceleration of a stop and at invalid times, within ``acceleration_limit``. None is 5 units/s^2 and 10 rad/s^2,
         or the largest acceleration of the desired motion if that is more.
