@@ -81,7 +81,7 @@ def fold(name: str, left_out: int, retime: float) -> dict[str, Any]:
         "place_warp": abs(phase - truth),
         "share_clock": abs(now / average - share[seen][-1]),
         "share_warp": abs(phase - share[seen][-1]),
-        "standardized": abs(phase - truth) / std,
+        "standardized": abs(phase - truth) / std if std > 0.0 else math.nan,  # where timing is not seen to vary
         "rest_clock": errors[1],
         "rest_warp": errors[0],
         "fit_seconds": fitted - start,
@@ -117,7 +117,7 @@ def main() -> None:
     print("|" + " --- |" * (3 * len(keys) + 3))
     for name in options.sets:
         own = [row for row in rows if row["set"] == name]
-        usual = math.sqrt(np.mean([row["standardized"] ** 2 for row in own]))
+        usual = math.sqrt(np.nanmean([row["standardized"] ** 2 for row in own]))
         cells = " | ".join(difference(own, key) for key in keys)
         print(f"| {name} | {'yes' if name in CHOSEN_ON else 'no'} | {cells} | {usual:.1f} |")
     seconds = [np.mean([row[f"{key}_seconds"] for row in rows]) for key in ("fit", "condition")]
