@@ -524,7 +524,27 @@ def test_samples_that_are_stamped_in_pairs_say_what_one_of_each_pair_says(statio
         mean, deviation = model.predict(grid, return_std=True)
         np.testing.assert_allclose(deviation, np.hypot(smooth, white), rtol=0.7)
         np.testing.assert_allclose(mean, grid[:, 0], atol=smooth)
-        assert model.predict_uncertainty(grid).type1.max() < 0.01
+        assert model.predict_uncertainty(grid).type1.max() < 0.05
+
+
+def test_copies_of_what_no_mean_follows_are_as_uncertain_as_it_is_wrong(rng):
+    t = np.linspace(0.0, 1.0, 300)
+    y = np.sin(6.0 * t) + 0.05 * rng.normal(size=300)  # the mean was off by 0.04 under a deviation of 1e-6, once
+    model = HeteroscedasticGPRegressor()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        model.fit(np.tile(t, 2)[:, np.newaxis], np.tile(y, 2), groups=np.repeat([0, 1], 300))
+    mean, deviation = model.predict(t[:, np.newaxis], return_std=True)
+    assert np.sqrt(np.square((y - mean) / deviation).mean()) < 2.0
+
+
+@pytest.mark.parametrize("size", [3, 15])
+def test_samples_that_come_in_bursts_are_one_each(size, rng):
+    t = np.add.outer(np.linspace(0.0, 1.9, 20), 1e-5 * np.arange(size)).ravel()
+    y = t + 0.05 * rng.normal(size=(8, 1)) + 0.005 * rng.normal(size=(8, len(t)))
+    model = HeteroscedasticGPRegressor().fit(np.tile(t, 8)[:, None], y.ravel(), groups=np.repeat(range(8), len(t)))
+    deviation = model.predict(np.linspace(0.0, 1.9, 201)[:, np.newaxis], return_std=True)[1]
+    np.testing.assert_allclose(deviation, 0.05, rtol=0.7)  # 1e12 times as large, once
 
 
 @pytest.mark.parametrize(

@@ -179,7 +179,8 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         period = period_in_ranges(self.period, self.kernel, scaling.x_scale)
         held, circle = (None if value is None else self._door(value) for value in (length_scale, period))
         prior_tril = self._prior_tril(training, scaling)
-        identical = warn_if_identical(training)
+        identical = warn_if_identical(training) and groups is not None
+        training = training if groups is None else training.without_near_inputs()
         # A mean that does not follow the data at the merged inputs is fitted anew, from all rows.
         rows, training = training, training.merged(self.max_inputs)
         group = None if groups is None else self._door(groups).long()

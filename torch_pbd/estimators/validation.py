@@ -42,7 +42,7 @@ def checked_values(values: Any, name: str) -> Any:
         labels = list(getattr(values, "column_names", values.columns))  # pyarrow's columns are arrays
         if twice := {label for label in labels if labels.count(label) > 1}:
             raise ValueError(
-                f"{name} has several columns {min(twice)!r}, must have one of each name: rename the others."
+                f"{name} has several columns {min(twice, key=str)!r}, must have one of each name: rename the others."
             )
         for label in labels:
             _check_numbers(checks.real_array(values[label], f"column {label} of {name}"), f"{name}[{label!r}]")
@@ -230,7 +230,7 @@ def warn_if_few(
 
 
 def warn_if_identical(training: TrainingSet) -> bool:
-    """Warn of outputs that, up to rounding, never vary where inputs repeat; whether most inputs do, and none varies.
+    """Warn of outputs that, up to rounding, never vary where inputs repeat; whether all inputs do, and none varies.
 
     Outputs are constant where no input repeats.
     """
@@ -238,10 +238,10 @@ def warn_if_identical(training: TrainingSet) -> bool:
     squares = training.squares if repeated else (training.y - training.y.mean(0)).square()
     identical = float(squares.sum(0).max()) < 1e-18 * max(1, repeated or len(training.y) - 1)
     if repeated:  # a row or two that were written twice say nothing of the others
-        identical &= bool((training.counts > 1).double().mean() > 0.5)
+        identical &= bool((training.counts > 1).double().mean() >= 0.5)
     if identical:
         checks.warn(ALIKE, DataRankWarning)
-    return identical and repeated > 0
+    return identical and bool(training.counts.min() > 1)
 
 
 def fit_with_groups(regressor: Any, X: ArrayLike, y: ArrayLike, groups: ArrayLike) -> Any:

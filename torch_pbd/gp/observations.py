@@ -18,8 +18,6 @@ _N_NODES, _WORTH = (32, 48, 88, 168), 1.5
 SHORTEST = 0.75
 """Length scale in spacings of the inputs, below which "needles" explain each point by itself."""
 
-# Of the gaps' quantile: stamps that come in pairs are as far from the next pair as this says, and not from each other.
-_OF_GAPS = 0.4
 _LONGEST = 0.35  # largest length scale as a share of the range: with longer ones a covariance never reached its prior
 # A hole is so much of the range, and so many spacings of the other inputs. It is to hold so many length scales: a
 # smooth process without noise claims to know what is two to three of them from many inputs.
@@ -55,21 +53,15 @@ def resolved_length_scale(inputs: Float[Tensor, "n e"]) -> float:
 def spacing(inputs: Float[Tensor, "n e"], quantile: float = 0.9) -> float:
     """Quantile over the inputs of the distance to the nearest other input: the finest detail they show."""
     if inputs.shape[1] == 1:
-        gap = inputs[:, 0].sort().values.diff()
-        nearest = torch.minimum(*(torch.nn.functional.pad(gap, side, value=math.inf) for side in ((1, 0), (0, 1))))
-        return max(_quantile(nearest, quantile), _OF_GAPS * _quantile(gap, quantile))
+        gap = torch.nn.functional.pad(inputs[:, 0].sort().values.diff(), (1, 1), value=math.inf)
+        nearest = torch.minimum(gap[1:], gap[:-1]).sort().values  # torch's quantile takes at most 16 million
+        place = quantile * (len(nearest) - 1)
+        pair = nearest[int(place) : int(place) + 2]
+        return float(torch.lerp(pair[0], pair[-1], place % 1.0))
     chosen = torch.arange(0, len(inputs), max(1, len(inputs) // 1000), device=inputs.device)
     distance = torch.cdist(inputs[chosen], inputs, compute_mode="donot_use_mm_for_euclid_dist")
     distance[torch.arange(len(chosen)), chosen] = math.inf
     return float(distance.amin(1).quantile(quantile))
-
-
-def _quantile(values: Float[Tensor, " n"], quantile: float) -> float:
-    """Quantile of any number of values; torch's takes at most 16 million."""
-    values = values.sort().values
-    place = quantile * (len(values) - 1)
-    pair = values[int(place) : int(place) + 2]
-    return float(torch.lerp(pair[0], pair[-1], place % 1.0))
 
 
 def longest_within(inputs: Float[Tensor, "n e"]) -> float:

@@ -13,7 +13,7 @@ from torch.nn.utils.rnn import pad_sequence
 from torch_pbd.gp.observations import neighbourhoods, spacing, sum_by
 from torch_pbd.linalg import scale_tril_from_root
 
-_NEAR = 0.1  # of the spacing of the inputs: no length scale tells apart what is so near
+_NEAR = 0.1  # of the spacing of the inputs, or of the mean one
 _CHUNK = 1024  # inputs that a mean is evaluated at together: its correlations take 8 kB for each, of 1000 inputs
 
 
@@ -60,11 +60,14 @@ class TrainingSet:
             return self
         return self._by(neighbourhoods(self.inputs, max_inputs))
 
-    def without_near_pairs(self) -> "TrainingSet":
-        """Rows with inputs on a line taken together where they are far nearer than most are: stamps written twice."""
-        if self.inputs.shape[1] > 1 or len(self.inputs) < 2:
+    def without_near_inputs(self) -> "TrainingSet":
+        """Rows with inputs on a line, each of several rows, taken together where they are far nearer than most: stamps
+        in pairs or bursts, which no length scale tells apart.
+        """
+        if self.inputs.shape[1] > 1 or int(self.counts.min()) < 2:
             return self
-        near, first, run = _NEAR * spacing(self.inputs), -math.inf, -1
+        extent = float(self.inputs.max() - self.inputs.min())
+        near, first, run = _NEAR * max(spacing(self.inputs), extent / len(self.inputs)), -math.inf, -1
         runs = []
         order = self.inputs[:, 0].argsort(stable=True)
         for place in self.inputs[order, 0].tolist():

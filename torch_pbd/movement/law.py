@@ -241,7 +241,7 @@ def _stacked(model: Any, shown: Demonstrations, *, is_fit: bool) -> tuple[Floats
         model.input_ = "time" if timed or shown.is_aligned else "phase"
         if shown.alignment == "dtw":
             checks.warn(TIMING_REMOVED)
-    elif model.input_ == "array":
+    elif model.input_ == "array" and not timed:
         raise ValueError("X is Demonstrations, but the fit was of arrays: give X, y, groups as they were made for it.")
     X, y, groups = shown.stack(input="phase" if timed else model.input_)
     if timed:  # demonstrations of different durations would otherwise be stacked over phase

@@ -26,6 +26,7 @@ _N_STEPS, _TOLERANCE = 40, 0.02  # expectation maximization: most iterations, an
 _SMOOTH = 1e-3  # largest nugget of a step that is distinguished from noise: such steps determine the length scale
 _NEAR = 2.5  # factor around a length scale within which it is searched again once there are nuggets
 _USUAL = 2.0  # factor around the median within which the size of a step's residuals is usual
+_MOST_FIRST = 100  # steps of the first search: twice as many as the shortest length scale is spacings of
 _ROUNDS = 3  # alternations of nuggets and length scale, which depend on each other
 # Nats a demonstration. Kernels that a step of noise had decided on lost 14 to 99, of recordings others gained up to 9
 # and left-out demonstrations nothing.
@@ -112,6 +113,7 @@ def fit_weighted(
     for _ in range(_FITS):
         weighted = weight[:, None, None] * residual
         found, square = fit_time_kernel(grid, weighted, deviation, kernels, share)
+        kernels = (found.kernel,)
         # The kernel is of weighted residuals, each output's over its rms; these are about the unweighted ones' squares.
         square = square * weighted.square().nanmean() / (weight.square() * residual.square().nanmean())
         df = most if is_even else movement_df(square, size, most)
@@ -159,7 +161,10 @@ class _Output:
 
     def start(self, kernel: str) -> Start:
         """Likeliest length scale of the usual steps, and the nugget of each step under it."""
-        found = self.search(self.usual_steps(), kernel)
+        usual = self.usual_steps().nonzero()[:, 0]
+        some = torch.zeros_like(self.grid, dtype=torch.bool)
+        some[usual[:: math.ceil(len(usual) / _MOST_FIRST)]] = True
+        found = self.search(some, kernel)
         unit = self._candidates([found.scales], kernel)[0]
         nugget = self._step_nuggets(unit, _LEAST)
         return Start(found, nugget, float(_log_likelihood((unit + torch.diag(nugget))[None], self.residual)))
@@ -195,9 +200,10 @@ class _Output:
         return TimeKernel(kernel, **parts, residual=filled[..., None], share=nugget.new_ones(()))
 
     def usual_steps(self) -> Bool[Tensor, " T"]:
-        """Steps at which residuals are of about the median size."""
+        """Steps at which residuals are of about the median size, or all where these are fewer than half."""
         sizes = self.residual.square().nanmean(0).sqrt()
-        return (sizes > sizes.nanmedian() / _USUAL) & (sizes < sizes.nanmedian() * _USUAL)
+        usual = (sizes > sizes.nanmedian() / _USUAL) & (sizes < sizes.nanmedian() * _USUAL)
+        return usual if 2 * int(usual.sum()) >= len(usual) else torch.ones_like(usual)
 
     def search(self, steps: Bool[Tensor, " T"], kernel: str, near: float | None = None) -> Found:
         """Likeliest length scale at some steps, among all or among those near a previous one."""
@@ -216,10 +222,9 @@ class _Output:
         self, steps: Bool[Tensor, " T"], kernel: str, candidates: Sequence[Scales], nuggets: Sequence[float]
     ) -> Found:
         """Highest log likelihood of ``(1 - eta) K + eta I`` at some steps, with its scales and shared nugget eta."""
-        steps = steps if 2 * int(steps.sum()) >= len(steps) else torch.ones_like(steps)
         rows, unit = _unit_rms(self.residual[:, steps]), self._candidates(candidates, kernel, steps)
         eye = torch.eye(unit.shape[1]).to(unit)
-        table = torch.stack([_log_likelihood((1.0 - eta) * unit + eta * eye, rows) for eta in nuggets])
+        table = torch.stack([_log_likelihood(torch.lerp(unit, eye, eta), rows) for eta in nuggets])
         best = int(table.argmax())
         return Found(float(table.max()), candidates[best % len(candidates)], nuggets[best // len(candidates)])
 
@@ -276,7 +281,8 @@ def _log_likelihood(covariance: Float[Tensor, "b n n"], residual: Float[Tensor, 
     """Log density of series with holes, up to a constant; minus infinity where a matrix is singular."""
     total = covariance.new_zeros(len(covariance))
     for seen, rows in _by_pattern(residual):
-        root, info = torch.linalg.cholesky_ex(covariance[:, seen][:, :, seen])
+        own = covariance if bool(seen.all()) else covariance[:, seen][:, :, seen]
+        root, info = torch.linalg.cholesky_ex(own)
         whitened = torch.linalg.solve_triangular(root, rows.expand(len(root), *rows.shape), upper=False)
         value = -0.5 * whitened.square().sum((1, 2)) - rows.shape[1] * root.diagonal(dim1=1, dim2=2).log().sum(1)
         total += torch.where((info == 0) & torch.isfinite(value), value, -torch.inf)

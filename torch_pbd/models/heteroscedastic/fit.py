@@ -52,6 +52,7 @@ _LEAST_OWN = 1e-4
 # Residuals of a first mean that are wrong: of less than this share of the variance taken for noise, or of more than
 # that share of y's variance, which is a mean of nothing and doubtful in few rows too.
 _MUCH_LESS, _NEARLY_ALL = 0.25, 0.9
+_FOLLOWED = 1e-3  # of the deviation of y: farther from copies of one demonstration a mean does not follow it
 _WORTH_A_WARNING = 0.03  # share of y's variance missed by the mean that warns; at a corner, a smooth mean misses less
 
 
@@ -96,9 +97,6 @@ class HeteroscedasticFit:
         noise = self.noise_correlation(self.mean_rows, squares=False)
         self.mean = fit_mean(self._mean_search, self.mean_rows, self.noise_tril(self.mean_rows.inputs), noise)
         self.residual = self.mean.residual(self.training)
-        if self.identical:
-            self.residual.zero_()
-            return
         if anew is None or self._follows():
             return
         if (start := mean_start(anew, self.mean, self.pooled_tril, self.options)) is not None:
@@ -177,9 +175,6 @@ class HeteroscedasticFit:
             # themselves, which takes three more than outputs.
             n_rows = max(self.n_demos, self._n_outputs + 3)
             self.training = self.training.merged(max(8, len(self.training.x) // n_rows))
-            # Of inputs far nearer than a demonstration is correlated the difference would count as known exactly, and
-            # a covariance that has it as its slope is anything where the next inputs are far.
-            self.training = self.training.without_near_pairs()
             self.mean_rows = self.training if self._mean_search.held is None else self.mean_rows.merged(MOST_INPUTS)
 
     def normal(self) -> Float[Tensor, "rows d"]:
@@ -230,11 +225,14 @@ def fit_heteroscedastic(
     fit = HeteroscedasticFit(training, group, identical, to_try[0], larger, options)
     # Share of the rows that count before the correlation of a demonstration's samples is known.
     first_part = 1.0 if group is None else min(1.0, _FIRST_SAMPLES * fit.n_demos / len(group))
+    given = training
     started, turn, n_turns = time.perf_counter(), 0, _TURNS
     while turn < n_turns:
         options.slack = _SLACK if turn < n_turns - 1 else 1.0
         # mu given C and L, by generalized least squares, and the residuals r = y - mu.
         fit.fit_mean(rows if turn == 0 else None)
+        if identical:
+            fit.residual.zero_()
         # The share 1 - h of a degree of freedom that fitting mu has left of each.
         training, share = fit.training, fit.shares()
         # C C' = sum of r r' / sum of (1 - h), once: what changes later is L's.
@@ -259,4 +257,7 @@ def fit_heteroscedastic(
         if turn < n_turns - 1:
             fit.correlate()
         turn += 1
+    if identical and bool((fit.mean.residual(fit.training).abs() > _FOLLOWED).any()):
+        # What is common to them is no mean that can be learned: what it leaves is all that says how far it errs.
+        return fit_heteroscedastic(given, group, to_try, options, rows=rows)
     return fit

@@ -30,7 +30,9 @@ from torch_pbd.models.training import TrainingSet
 
 _LEAST_DEGREES = 3.0  # below two, Student's t has no covariance
 # Longest length scale by which distance from the data is judged, in ranges of the input times the number of inputs;
-# but two spacings of most inducing inputs at least, or half the range: of two stations, the prior is back a range away.
+# but two spacings of the inducing inputs at least. Of few stations on a line, two of most spacings, as a hole is none,
+# and half the range, or the prior would not be back a range away from two of them.
+_STATIONS = 10
 _REACH = 0.1
 # Variance of Fisher's z of a correlation that is uniform from -1 to 1.
 _UNIFORM = math.pi**2 / 12.0
@@ -172,7 +174,10 @@ def nearness(log_variances: Processes) -> Processes:
     """
     family, weight = log_variances.family, log_variances.amplitude.square()
     scale = ((weight / weight.sum()) @ log_variances.length_scale.log()).exp()
-    scale = scale.clamp_max(_REACH * len(scale)).clamp_min(min(0.5, 2.0 * spacing(family.inducing, 0.75)))
+    least = 2.0 * spacing(family.inducing)
+    if len(scale) == 1 and len(family.inducing) < _STATIONS:
+        least = min(0.5, 2.0 * spacing(family.inducing, 0.75))
+    scale = scale.clamp_max(_REACH * len(scale)).clamp_min(least)
     family = replace(family, fixed_length_scale=scale, kernel="squared_exponential", stretch=None)
     return replace(family, amplitude=1.0, constant=0.0).prepared(torch.zeros_like(log_variances.theta[:1]))
 
