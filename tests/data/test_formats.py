@@ -50,6 +50,11 @@ def test_parquet_is_a_long_table(tmp_path):
     assert load_demonstrations(tmp_path / "indexed.parquet", demo="trial", outputs=["x", "y", "z"]) == recorded
     with pytest.raises(DataFormatError, match="max_bytes=1000"):
         load_demonstrations(tmp_path / "set.parquet", max_bytes=1000)
+    for kind in (pa.list_(pa.float64()), pa.list_(pa.float32(), 3)):
+        lists = pa.table({"time": TIMES[0], "pos": pa.array(np.float32(PATHS[0]).tolist(), kind)})
+        pq.write_table(lists, tmp_path / "lists.parquet")
+        made = load_demonstrations(tmp_path / "lists.parquet")
+        assert made == Demonstrations(TIMES[0], [np.float32(PATHS[0])], names=["pos_x", "pos_y", "pos_z"])
 
 
 def write_lerobot(folder, version):
@@ -329,6 +334,13 @@ def test_arrays_of_one_width_are_recordings_by_number_and_signals_by_name(tmp_pa
     for name, options in (("time", {}), ("stamp", {"time": "stamp"})):
         np.savez(tmp_path / "runs.npz", demo_0=first, demo_1=other, **{name: TIMES[0]})
         assert load_demonstrations(tmp_path / "runs.npz", **options) == Demonstrations(TIMES[0], [first, other])
+    arms = {"arm0_pos": first, "arm1_pos": other}
+    np.savez(tmp_path / "arms.npz", **arms, time=TIMES[0])
+    both = load_demonstrations(tmp_path / "arms.npz", outputs=[*arms])
+    names = [f"{name}_{i}" for name in arms for i in range(3)]
+    assert both == Demonstrations(TIMES[0], [np.c_[first, other]], names=names)
+    np.savez(tmp_path / "uneven.npz", alice=first, bob=other[:-1])
+    assert load_demonstrations(tmp_path / "uneven.npz", rate=RATE).n_steps == (5, 4)
 
 
 # ROS

@@ -108,6 +108,9 @@ def test_names_that_are_numbers_are_names_beside_others_that_are_none(tmp_path):
     save_demonstrations(numbered, tmp_path / "set.csv")
     assert load_demonstrations(tmp_path / "set.csv") == numbered
     assert load_text(tmp_path, "sep=;\ntime;1\n0;1\n1;2\n", outputs=["1"]) == numbered
+    for line in ('sep="', "sep=\r"):  # no mark
+        assert load_text(tmp_path, f"{line}\ntime;1\n0;1\n1;2\n") == numbered
+    assert load_text(tmp_path, "sep=;\ntime,1\n0,1\n1,2\n", delimiter=",") == numbered
 
 
 def test_large_files_are_refused_before_they_are_read(tmp_path):
@@ -233,6 +236,13 @@ def test_columns_of_csv_are_chosen_and_ordered(tmp_path):
             {},
             "line 1: no columns but one, 'demo|time|x', by [',', ';', '\\t'] and the decimal mark '.'",
         ),
+        (
+            "nan,0.1,0.2\n1,0.2,0.3\n2,0.4,0.5\n",
+            {"rate": 10},
+            "line 1: it must name the columns, and has numbers: [nan",
+        ),
+        ("0,5;1,5\n1;2\n2;3\n", {"rate": 10, "decimal": ","}, "line 1: it must name the columns, and has numbers"),
+        ("time,x\n2024-01-01 00:00:01,1\nabc,2\n", {}, "'abc' is no date or time, must be a date"),
         ("sep=;\ndemo;time;x\n0;0;1\n0;1;a\n", {}, "line 4, column 'x': 'a' is not a finite number"),
         (CSV.replace("5,6", ",6"), {}, "line 4, column 'x': the cell is blank"),
         (CSV.replace("b,0.0", ",0.0"), {}, "line 4, column 'demo': the cell is blank"),

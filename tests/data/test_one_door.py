@@ -123,7 +123,7 @@ def test_words_for_missing_cells_are_dropped_on_request(tmp_path, cell):
         assert load_text(tmp_path, text, missing="drop").n_steps == (2,)
 
 
-@pytest.mark.parametrize("blank", ["", "NaN"])
+@pytest.mark.parametrize("blank", ["", "NaN", "NaT"])
 def test_a_time_that_is_missing_changes_no_other(tmp_path, blank):
     dates = "time,x\n" + "".join(
         f"{stamp},{i}.5\n" for i, stamp in enumerate(["10:00:00", blank, "10:00:01", "10:00:02"])
@@ -215,6 +215,9 @@ def test_frames_of_other_libraries_are_taken(library):
 def test_labels_may_be_of_several_kinds():
     table = pd.DataFrame({"demo": ["a", 1, "a", 1], "time": [0.0, 0.0, 1.0, 1.0], "x": [0.5, 1.0, 2.0, 4.0]})
     assert [position.ravel().tolist() for _, position in Demonstrations.from_frame(table)] == [[0.5, 2.0], [1.0, 4.0]]
+    table["demo"] = [["a"], ["b"]] * 2
+    with pytest.raises(ValueError, match="column 'demo' holds lists or alike, must be texts or numbers"):
+        Demonstrations.from_frame(table)
 
 
 @pytest.mark.parametrize("blank", [None, pd.NA, np.nan])
@@ -269,6 +272,8 @@ def test_frames_of_polars_have_types_of_their_own():
     assert made == Demonstrations(
         [[0, 20 * 2], [0, 20, 40]], [[0.001, 0.003], [0.004, 0.005, 0.006]], names=["x"], units="m", time_unit="ms"
     )
+    pairs = pl.DataFrame({"time": [0.0, 1.0], "pos": pl.Series([[1, 2], [3, 5]], dtype=pl.Array(pl.Float64, 2))})
+    assert Demonstrations.from_frame(pairs) == Demonstrations([0, 1], [[[1, 2], [3, 5]]], names=["pos_x", "pos_y"])
     with pytest.raises(ValueError, match=r"table is .*, must be a dataframe .*with its rows: collect\(\) lazy ones"):
         Demonstrations.from_frame(table.lazy())
     with pytest.raises(ValueError, match="column 'demo' is blank in row 3: it tells the demonstrations apart"):

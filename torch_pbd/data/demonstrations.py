@@ -15,7 +15,7 @@ from torch_pbd.data.editing import Alignment, Editing
 from torch_pbd.data.poses import as_chart, as_columns, as_reference, find_suspects, unwrapped
 from torch_pbd.data.recordings import Missing, as_names, as_recordings, as_units, frozen, preview
 from torch_pbd.data.units import TIMES, check_unit
-from torch_pbd.data.wanted import OPTIONS, Wanted, check_options
+from torch_pbd.data.wanted import OPTIONS, Wanted, check_options, column_names
 from torch_pbd.exceptions import InvalidParameterError
 
 
@@ -258,7 +258,8 @@ class Demonstrations(Editing):
         if not all(isinstance(name, str) for name in rows.columns):
             raise checks.refusal(rows.columns, "table.columns", "texts", "join levels, ['_'.join(c) for c in columns]")
         wanted = Wanted(**options)
-        chosen = wanted.choose({name: (name,) for name in rows.columns}, demo="demo", time="time")
+        known = {name: column_names(name, rows.get_column(name)[:1].to_numpy().shape) for name in rows.columns}
+        chosen = wanted.choose(known, demo="demo", time="time")
         signals = {name: rows.get_column(name).to_numpy() for name in chosen.signals}
         [content] = wanted.since_first([wanted.read_rows(chosen, signals)])
         return wanted.finish([cls(**content)])

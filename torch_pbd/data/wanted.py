@@ -129,6 +129,8 @@ class Wanted:
         """Arguments as from :meth:`read_each` for a long table, with demonstrations in order of their first rows."""
         n_rows = len(signals[chosen.signals[0]])
         demo = np.zeros(n_rows, bool) if chosen.demo is None else _column(signals, chosen.demo)
+        if chosen.demo and demo.dtype == object and any(label.__hash__ is None for label in demo):
+            raise ValueError(f"column {chosen.demo[0]!r} holds lists or alike, must be texts or numbers: convert it.")
         heads = np.flatnonzero(np.r_[True, demo[1:] != demo[:-1]][:n_rows])
         blank = [row for row in heads if demo[row] is None or demo[row] != demo[row]]
         if chosen.demo and blank:

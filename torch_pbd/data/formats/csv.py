@@ -23,7 +23,7 @@ from torch_pbd.files import LOADERS
 _DELIMITERS = (",", ";", "\t")
 _LONGEST_HEADER = 2**17  # characters, of thousands of columns; a file without line ends would be one header
 _MOST_COMMENTS = 1000  # lines before the header
-_MISSING = ("", "nan", "+nan", "-nan", "na", "null", "none")
+_MISSING = ("", "nan", "+nan", "-nan", "nat", "na", "null", "none")
 _CLOCK = re.compile(r"(?:([\d-]{10})[T ])?(\d\d?):(\d\d?)(?::(\d\d))?(?:[.,](\d{1,9}))?(?:Z|([+-]\d\d):?(\d\d)?)?")
 _WHOLE = re.compile(r"[+-]?\d{16,19}")  # stamps in ns, which float64 does not hold
 
@@ -61,8 +61,8 @@ class _Table:
     def __init__(self, file: TextIO, delimiter: str | None, decimal: str, wanted: Wanted) -> None:
         self.file, self.decimal, self.missing = file, decimal, wanted.missing
         first, self.n_before = _header_line(file)
-        if excel := re.fullmatch(r'"?sep=(.)"?\s*', first):
-            delimiter, first, self.n_before = excel[1], file.readline(_LONGEST_HEADER), self.n_before + 1
+        if excel := re.fullmatch(r'"?sep=([^"\r\n]?)"?\s*', first):
+            delimiter, first, self.n_before = delimiter or excel[1], file.readline(_LONGEST_HEADER), self.n_before + 1
         candidates = [delimiter] if delimiter else [mark for mark in _DELIMITERS if mark != decimal]
         try:
             if first.startswith("# format:"):
@@ -71,7 +71,8 @@ class _Table:
             # A mark that is not the delimiter finds one column, or cuts names that hold it.
             sought = {wanted.demo, wanted.time or "time", *(wanted.outputs or ())}
             self.header = max(headers, key=lambda names: (len(sought & set(names)), len(names)))
-            if self.header and all(_is_number(name) or _CLOCK.fullmatch(name) for name in self.header):
+            cells = [name.replace(decimal, ".") for name in self.header]
+            if cells and all(_is_number(c) or _CLOCK.fullmatch(c) or c.lower() in _MISSING[1:] for c in cells):
                 raise ValueError(f"it must name the columns, and has numbers: {preview(self.header)}.")
             if len(self.header) == 1 and wanted.rate is None:
                 what = f"no columns but one, {self.header[0]!r:.80}, by {candidates} and the decimal mark {decimal!r}"
@@ -163,7 +164,8 @@ class _Table:
         kind = "a number" if match is None else "a date" if match[1] else "a time of day"
         if cell.strip().lower() not in _MISSING:
             if kind != (self.kind or kind):
-                raise ValueError(f"{cell!r} is {kind}, must be {self.kind} as those above: write all in one way.")
+                what = kind if match or _is_number(cell.replace(self.decimal, ".")) else "no date or time"
+                raise ValueError(f"{cell!r} is {what}, must be {self.kind} as those above: write all in one way.")
             self.kind = kind
         if match is None:
             return int(cell) if _WHOLE.fullmatch(cell.strip()) else self._read_number(cell)

@@ -25,7 +25,9 @@ _CODECS |= {"transpose", "sharding_indexed", "numcodecs.shuffle", "numcodecs.del
 def read_parquet(path: Path, wanted: Wanted) -> Arguments:
     """Read a long Parquet table with one row per sample."""
     with _open_parquet(path) as file:
-        chosen = wanted.choose({name: (name,) for name in file.schema_arrow.names}, demo="demo", time="time")
+        _read_columns(file, (), wanted)  # refuses what is too large
+        signals = {field.name: column_names(field.name, _first_shape(file, field)) for field in file.schema_arrow}
+        chosen = wanted.choose(signals, demo="demo", time="time")
         return wanted.read_rows(chosen, _read_columns(file, chosen.signals, wanted))
 
 
@@ -48,6 +50,11 @@ def _read_column(file: Any, name: str) -> NDArray[Any]:
     if len({part.shape[1:] for part in parts}) > 1:
         raise ValueError(f"column {name!r} has lists that differ in length.")
     return np.concatenate(parts)  # whole numbers become floats where some are absent
+
+
+def _first_shape(file: Any, field: Any) -> tuple[int, ...]:
+    batches = file.iter_batches(1, columns=[field.name], use_threads=False) if field.type.num_fields == 1 else ()
+    return next(((1, len(batch.column(0)[0].as_py() or [0])) for batch in batches), (1,))
 
 
 def _as_array(column: Any) -> NDArray[Any]:

@@ -65,14 +65,15 @@ def read_array_file(path: Path, wanted: Wanted) -> Arguments:
 
 
 def _read_other(arrays: Mapping[str, NDArray[Any]], wanted: Wanted) -> Arguments:
-    """Arrays by names that mean nothing to us: (K, T, d), or numbered recordings (T, d), or signals of one."""
+    """Arrays by names that mean nothing: (K, T, d), or recordings (T, d) by numbers or lengths, or signals of one."""
     arrays = {name: array for name, array in arrays.items() if array.dtype.kind in "biuf" and 1 <= array.ndim <= 3}
     names = sorted(arrays, key=natural)
     deep = [arrays[name] for name in names if arrays[name].ndim == 3]
     flat = [name for name in names if arrays[name].ndim == 2]
     others = {name: arrays[name] for name in names if name not in flat}
     fits = len({arrays[name].shape[1] for name in flat}) == 1
-    alike = len({re.sub(r"\d+", "", name) for name in flat}) == 1
+    apart = len({re.sub(r"\d+", "", name) for name in flat}) == 1 or len({len(arrays[name]) for name in flat}) > 1
+    apart = apart and not any(output.startswith(name) for output in wanted.outputs or () for name in flat)
     shapes = preview([f"{name} {arrays[name].shape}" for name in names])
     if deep:
         shape = deep[0].shape[:2]
@@ -80,7 +81,7 @@ def _read_other(arrays: Mapping[str, NDArray[Any]], wanted: Wanted) -> Arguments
         signals = {n: np.broadcast_to(a, shape) if a.shape == shape[1:] else a for n, a in arrays.items()}
         signals = {n: a for n, a in signals.items() if a.shape[:2] == shape}
         recordings = [{name: array[k] for name, array in signals.items()} for k in range(shape[0])]
-    elif fits and alike and (flat == names or (len(flat) > 1 and others.keys() <= {wanted.time, "time", "t"})):
+    elif fits and apart and (flat == names or (len(flat) > 1 and others.keys() <= {wanted.time, "time", "t"})):
         recordings = [{"y": arrays[name]} | others for name in flat]
     elif len({len(array) for array in arrays.values()}) == 1:
         if fits and flat == names and not wanted.outputs:
