@@ -5,7 +5,7 @@ from sklearn.base import BaseEstimator
 
 from torch_pbd import GMMBaseline
 from torch_pbd.data import make_paper_simulation, paper_covariance
-from torch_pbd.experiments.comparison import compare_models, empirical_covariances
+from torch_pbd.experiments.comparison import compare_models, empirical_covariances, explained
 from torch_pbd.metrics import covariance_mse
 
 
@@ -69,3 +69,11 @@ def test_our_mixture_regression_is_that_of_scikit_learn(n_components):
     assert ours.score(X, y) == pytest.approx(expected, abs=1e-2)  # they may end in different optima
     if n_components == 1:  # one optimum: but theirs adds 1e-6 to variances of other scales
         np.testing.assert_allclose(ours.predict_cov(X[:40]), theirs.predict(X[:40])[1], rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize(("least", "told"), [(-1.0, True), (-np.inf, False)])
+def test_the_best_is_told_in_short_lines_with_a_finite_margin(least, told):
+    text = explained([{"model": "long " * 20, "LL": 1.0}, {"model": "other", "LL": least}], "LL")
+    best = [part for part in text.split("\n\n") if part.startswith("best LL: long long")]
+    assert len(best) == told
+    assert all(len(line) <= 80 for part in best for line in part.splitlines())

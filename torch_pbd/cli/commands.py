@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import textwrap
 from argparse import Namespace
 from collections.abc import Callable, Sequence
 from itertools import takewhile
@@ -243,7 +244,8 @@ def _of_rows(models: dict[str, Any], why: str) -> dict[str, Any]:
     if not kept:
         raise ConfigError(f"models: there are only such of whole movements, which cannot be compared: {why}.")
     if left := [name for name in models if name not in kept]:
-        say(f"without {', '.join(left)}, as models of whole movements cannot be compared here: {why}\n")
+        line = f"without {', '.join(left)}, as models of whole movements cannot be compared here: {why}"
+        say(textwrap.fill(line, 80) + "\n")
     return kept
 
 

@@ -181,9 +181,8 @@ def explained(rows: Sequence[Mapping[str, Any]], best: str) -> str:
     shown = [name for name in rows[0] if any(row[name] == row[name] for row in rows)]
     ranked = sorted((row for row in rows if row[best] == row[best]), key=lambda row: -row[best])
     parts = [format_table(rows), textwrap.fill("; ".join(f"{n}: {_LEGEND[n]}" for n in shown if n in _LEGEND), 80)]
-    if len(ranked) > 1:
-        margin = ranked[0][best] - ranked[1][best]
-        parts.insert(1, f"best {best}: {ranked[0]['model']}, {margin:.2f} above {ranked[1]['model']}")
+    if len(ranked) > 1 and np.isfinite(gap := ranked[0][best] - ranked[1][best]):
+        parts.insert(1, textwrap.fill(f"best {best}: {ranked[0]['model']}, {gap:.2f} above {ranked[1]['model']}", 80))
     return "\n\n".join(parts)
 
 
