@@ -125,7 +125,7 @@ public:
         last_ = newest_ = now;
         step_ = 1.0 / rate_;
         is_regular_ = false;
-        n_bad_ = n_late_ = 0.0;
+        n_bad_ = n_late_ = n_good_ = 0.0;
         channel_.begin(from.force_bias);
         scale_ = {1.0, 1.0};
         desired_ = clock_.begin(now, from.at, from.position, orientation, from.velocity, state_.place);
@@ -226,6 +226,7 @@ private:
             faults |= keep_within(state_, before, step, top_speed_, acceleration_limit_);
         last_ = now;
         step_ += kSmoothing * (step - step_);
+        ++n_good_;
         return faults;
     }
 
@@ -245,9 +246,10 @@ private:
     /// Fault of a tick that is not like the last one.
     Faults read(double now) {
         if (is_regular_) {
-            const double made_up = kMadeUp * (last_ - newest_) / step_;
+            const double made_up = kMadeUp * n_good_;
             n_bad_ = std::max(0.0, n_bad_ - made_up);
             n_late_ = std::max(0.0, n_late_ - made_up);
+            n_good_ = 0.0;
             is_regular_ = false;
             newest_ = last_;
         }
@@ -292,7 +294,7 @@ private:
     State<N, M> state_{}, desired_{};
     double last_ = std::numeric_limits<double>::quiet_NaN();  ///< until when the motion is known
     double newest_ = 0.0, step_ = 0.0;  ///< reading of the clock, and how long ticks last
-    double n_bad_ = 0.0, n_late_ = 0.0;
+    double n_bad_ = 0.0, n_late_ = 0.0, n_good_ = 0.0;  ///< ticks, the good ones since the last that was not
     bool is_started_ = false, is_stopped_ = false, is_regular_ = false;
     Faults faults_ = 0;
 };

@@ -181,6 +181,14 @@ def test_a_loop_that_never_gets_going_stops_at_the_same_tick(steps, tmp_path):
     assert both.seen & TickStatus.STOPPED
 
 
+@pytest.mark.parametrize("fault", [0.0, 0.011])
+def test_ten_good_ticks_however_long_make_up_for_one(fault, rng, tmp_path):
+    both = Both(make_schedule(1, duration=3.0), tmp_path)
+    both.start(0.0)
+    for now in np.cumsum([step for _ in range(100) for step in (fault, *rng.uniform(0.5e-3, 1.5e-3, 10))]):
+        assert not both.tick(now, [1.0]) & TickStatus.STOPPED
+
+
 def test_before_start_it_stands(tmp_path):
     cpp = Both(constant(100.0, 10.0), tmp_path).cpp
     assert cpp.tick(0.001, [1.0]) == TickStatus.STOPPED

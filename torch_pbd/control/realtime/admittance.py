@@ -210,8 +210,8 @@ class RealTimeAdmittance:
         Raises
         ------
         ValueError, RuntimeError
-            If ``now`` is not a number or ``force`` not d numbers, at the third consecutive tick longer than
-            ``max_step``, before ``start``, or while another thread is in a tick. The state is then unchanged.
+            If ``now`` is not a number or ``force`` not d numbers, before ``start``, at the third tick after
+            it if all took longer than ``max_step``, or while another thread is in a tick. The state is then unchanged.
         """
         if not self._turn.acquire(False):
             raise RuntimeError(_SHARED)

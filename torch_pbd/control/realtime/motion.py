@@ -22,7 +22,7 @@ _DECELERATION = (5.0, 10.0)
 # Time readings must resolve ticks to 1 %: times since 1970 in s do, as floats in ns they do not. So much of a tick is
 # rounding of its length.
 _COARSE = 0.01
-# One late tick is a stall, and two may be; three consecutive ones mean that the loop is too slow.
+# One late tick is a stall, and two may be; three that were not made up for mean that the loop is too slow.
 _LATE_ON_END = 3
 # Share of a bad or late tick that a good one makes up for: by default a robot that braked in one at 5 m/s^2 is as fast
 # as before ten ticks later. A clock that repeats every other stamp, or one in ten, would hold it for ever.
@@ -96,7 +96,7 @@ class Motion:
         self.last = self._newest = now
         self.step = 1.0 / table.rate
         self.is_regular, self._is_new, self.is_stopped = False, True, False
-        self._n_bad = self._n_late = 0.0
+        self._n_bad = self._n_late = self._n_good = 0.0
         self.row, self.place = self._clock.begin(now, at, here, turned, moving)
         self.velocity, self.scale = moving, 1.0
         self._top_speeds = tuple(map(max, self._speeds_due, speeds))
@@ -138,6 +138,7 @@ class Motion:
         self.row, (self.place, self.velocity) = row, state
         self.last = now
         self.step += _SMOOTHING * (step - self.step)
+        self._n_good += 1
         return status
 
     def check_start(self, now: float) -> None:
@@ -167,9 +168,9 @@ class Motion:
     def _read(self, now: float) -> int:
         """Fault of a tick that differs from the last one."""
         if self.is_regular:
-            made_up = _MADE_UP * (self.last - self._newest) / self.step
+            made_up = _MADE_UP * self._n_good
             self._n_bad, self._n_late = max(0.0, self._n_bad - made_up), max(0.0, self._n_late - made_up)
-            self.is_regular, self._newest = False, self.last
+            self.is_regular, self._newest, self._n_good = False, self.last, 0.0
         if not self._newest < now < math.inf:
             self._n_bad += 1
             return TickStatus.CLOCK
