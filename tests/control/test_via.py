@@ -142,12 +142,28 @@ def test_a_controller_is_conditioned_within_its_movement():
     shown = demonstrations()
     apart = Demonstrations([TIME + 5.0 + 0.1 * k for k in range(len(shown))], shown.positions, units="m")
     controller = DMPController(ProMPBaseline()).fit(apart)
-    for time in (6.0, -0.1, 2.1):
-        with pytest.raises(
-            ValueError, match=rf"times\[1\] is {time} s, must be within the movement, 0 to 2: count from"
-        ):
+    for time in (6.0, -0.5, 2.5, 1000.0, 1.7e9):
+        message = rf"times\[1\] is {time} s, must be near the movement, -0.4 to 2.4: times are those of the demonstr"
+        with pytest.raises(ValueError, match=message):
             controller.condition([1.0, time], [controller.goal_] * 2)
-    controller.condition([-0.02, 2.02], [controller.start_, controller.goal_], noise_scale=1e-3)
+    controller.condition([-0.4, 2.4], [controller.start_, controller.goal_], noise_scale=1e-3)
+
+
+def test_a_controller_is_conditioned_on_all_samples_that_it_was_trained_on():
+    shown = demonstrations()
+    shown = Demonstrations([TIME * (1.0 + 0.15 * (k % 3 - 1)) for k in range(len(shown))], shown.positions, units="m")
+    controller = DMPController(ProMPBaseline()).fit(shown)
+    for times, positions in zip(shown.times[:3], shown.positions, strict=False):
+        bent = controller.condition(times[-1:], positions[-1:] + 0.02, noise_scale=1e-3)
+        assert np.linalg.norm(bent.predict([[2.0]]) - controller.predict([[2.0]])) > 0.01
+
+
+def test_phases_are_told_without_a_unit():
+    shown = demonstrations()
+    shown = Demonstrations([TIME / TIME[-1]] * len(shown), shown.positions, time_unit="1", units="m")
+    controller = DMPController(ProMPBaseline(), duration=2.0).fit(shown)
+    with pytest.raises(ValueError, match=r"times\[0\] is -0.3, must be near the movement, -0.2 to 1.2: times"):
+        controller.condition([-0.3], [controller.goal_])
 
 
 @pytest.mark.filterwarnings("ignore:via", "ignore:The reproduced movement is")

@@ -56,6 +56,8 @@ _LIMITS = MotionLimits()
 # Radius of gyration of a virtual mass, m. The inertia felt at the tool of a Panda along the made pose task is 5.01 to
 # 16.1 kg and 0.0761 to 0.774 kg m^2 (docs/poses.md): the roots of the ratio are 0.12 and 0.22 m, this their mean.
 _LEVER = 0.17
+# Share of the duration, before and after the movement, in which observations move it: longer recordings end there.
+_BEYOND = 0.2
 
 
 class Planning(BaseEstimator):
@@ -108,8 +110,8 @@ class Planning(BaseEstimator):
         Parameters
         ----------
         times : array-like of shape (m,)
-            Times in the units and origin of the demonstrations, within the movement: from ``start_time_`` on, and no
-            later than ``duration_`` after it.
+            Times of the demonstrations, in their units and origin: from ``start_time_`` to ``duration_`` after it, or
+            up to a fifth of that beyond, as in recordings longer than the median.
         positions : array-like of shape (m, d), or (m, p + 4) for poses
             Positions in the units of the recordings, NaN where an output is not given. Poses are p positions and a
             quaternion w x y z, or outputs; a rotation is given as a whole or not at all.
@@ -120,11 +122,12 @@ class Planning(BaseEstimator):
         """
         times = checks.array(times, "times", ("m",))
         time = self._movement_time(times[:, np.newaxis])
-        # Recordings with a common start begin up to a sample before or after it.
-        inside = np.abs(time - 0.5 * self.duration_) <= (0.5 + 1.0 / self.n_steps) * self.duration_
-        end = self.start_time_ + self.duration_ / self.time_scale_
-        must, remedy = f"within the movement, {self.start_time_:.10g} to {end:.10g}", "count from its start_time_"
-        checks.require(inside, times, "times", must, remedy, self.time_unit_)
+        inside = np.abs(time - 0.5 * self.duration_) <= (0.5 + _BEYOND + checks.ROUNDING) * self.duration_
+        first, last = (
+            self.start_time_ + share * self.duration_ / self.time_scale_ for share in (-_BEYOND, 1 + _BEYOND)
+        )
+        must, remedy = f"near the movement, {first:.10g} to {last:.10g}", "times are those of the demonstrations"
+        checks.require(inside, times, "times", must, remedy, "" if self.time_unit_ == "1" else self.time_unit_)
         position = self.outputs_.rows(positions, "positions")
         if position.shape != (len(time), self.n_outputs_):
             raise ValueError(f"positions has shape {position.shape}, must have shape ({len(time)}, {self.n_outputs_}).")
@@ -162,9 +165,9 @@ class Planning(BaseEstimator):
             Rate of the rows in Hz; the last row is at the end, ``duration_ / speed + settle``, and may follow sooner.
         settle : float, default=0.0
             Extra time in s after the movement, in which it comes to rest at the goal. A movement that was cut while
-            moving brakes along its path, half before its end and half after. Gains are at first those of the goal.
-            Later, by about a duration after the end unless phase_input="s", no data are near, and on_unknown="soft"
-            makes the robot compliant.
+            moving brakes along its path, half before its end and half after. Gains are at first those of the goal;
+            within a tenth to a half of the duration, where no data are near, on_unknown="soft" makes the robot
+            compliant. With phase_input="s" models that extrapolate flatly in s keep it stiff.
         goal, start : array-like of shape (d,), default=None
             Goal and start in the units of the recordings; None are ``goal_`` and ``start_``. A moving goal is (n, d),
             one row each, without ``via``. Poses, here and in ``via``, are p positions and a unit quaternion w x y z, or
