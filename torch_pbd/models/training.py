@@ -1,6 +1,5 @@
 """Training rows by distinct input, and the statistics of them to which models are fitted."""
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -62,21 +61,17 @@ class TrainingSet:
 
     def without_near_inputs(self) -> "TrainingSet":
         """Rows with inputs on a line, each of several rows, taken together where they are far nearer than most: stamps
-        in pairs or bursts, which no length scale tells apart.
+        in pairs or bursts, which no length scale tells apart, and no stretch of finer ones.
         """
         if self.inputs.shape[1] > 1 or int(self.counts.min()) < 2:
             return self
-        extent = float(self.inputs.max() - self.inputs.min())
-        near, first, run = _NEAR * max(spacing(self.inputs), extent / len(self.inputs)), -math.inf, -1
-        runs = []
-        order = self.inputs[:, 0].argsort(stable=True)
-        for place in self.inputs[order, 0].tolist():
-            if place - first > near:
-                first, run = place, run + 1
-            runs.append(run)
-        if run + 1 == len(runs):
-            return self
-        return self._by(torch.empty_like(order).index_copy(0, order, torch.tensor(runs, device=order.device)))
+        place, order = self.inputs[:, 0].sort(stable=True)
+        near = _NEAR * max(spacing(self.inputs), float(place[-1] - place[0]) / len(place))
+        run = torch.nn.functional.pad((place.diff() >= near).cumsum(0), (1, 0))
+        last = torch.bincount(run).cumsum(0) - 1
+        is_long = (place[last] - place[torch.searchsorted(run, run.unique())] >= near)[run]
+        runs = (is_long | (run.diff(prepend=run[:1] - 1) > 0)).cumsum(0) - 1
+        return self if int(runs[-1]) + 1 == len(place) else self._by(torch.empty_like(order).index_copy(0, order, runs))
 
     def _by(self, neighbourhood: Int64[Tensor, " n"]) -> "TrainingSet":
         index = neighbourhood[self.index]
