@@ -49,7 +49,7 @@ def test_a_bent_movement_passes_its_points_and_an_adjusted_one_too(learned):
     nearest = schedule.position[np.abs(schedule.time - at).argmin()]
     np.testing.assert_allclose(nearest, [0.47, 0.33], atol=2e-4)
     assert len(path["path"]) == 50
-    with pytest.raises(ValueError, match="within the movement"):
+    with pytest.raises(ValueError, match="near the movement"):
         learning.bend(learned, [(59.0, 0.47, 0.33)])  # which leaves the points there were
     softer = learning.adjust(
         learned, messages.as_settings({"models": ["CholeskyCovRegressor"], "stiffness_max": 300.0})
