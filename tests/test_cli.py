@@ -317,7 +317,7 @@ def test_the_demo_runs(tmp_path, capsys):
     assert main(["demo", "--output", str(tmp_path)]) == 0
     shown = capsys.readouterr()
     assert shown.err == ""
-    assert "95 % of fresh: " in shown.out
+    assert "95 % of fresh: " in " ".join(shown.out.split())
     robot = {"hgp_figure6_task.png", "hgp_figure7_variability.png", "hgp_figure8_pushes.png"}
     figures = {path.name for path in (tmp_path / "figures").iterdir()}
     assert figures == {"hgp.png", "cd.png", "wp.png", "gmm_5.png", "tunnel.png"} | robot
