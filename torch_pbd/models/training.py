@@ -69,6 +69,7 @@ class TrainingSet:
         near = _NEAR * max(spacing(self.inputs), float(place[-1] - place[0]) / len(place))
         run = torch.nn.functional.pad((place.diff() >= near).cumsum(0), (1, 0))
         last = torch.bincount(run).cumsum(0) - 1
+        # Each run is one input, and of runs that go on for longer every input is one by itself.
         is_long = (place[last] - place[torch.searchsorted(run, run.unique())] >= near)[run]
         runs = (is_long | (run.diff(prepend=run[:1] - 1) > 0)).cumsum(0) - 1
         return self if int(runs[-1]) + 1 == len(place) else self._by(torch.empty_like(order).index_copy(0, order, runs))
