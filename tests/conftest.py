@@ -13,7 +13,7 @@ TORCH_CONTROL = [
     *(f"stability.{part}" for part in ("common_function", "dynamics", "lyapunov")),
     *(f"simulation.{part}" for part in ("walls", "plant", "sensor", "rollout", "rollouts", "ticks")),
 ]  # fmt: skip
-TORCH_MOVEMENT = [f"movement.{part}" for part in ("joint", "time_kernel", "time_kernel_fit", "timing")]
+TORCH_MOVEMENT = [f"movement.{part}" for part in ("joint", "output_kernel", "time_kernel", "time_kernel_fit", "timing")]
 TORCH_FLOORS = [
     "linalg",
     "kernels",

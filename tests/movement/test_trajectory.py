@@ -23,7 +23,7 @@ from torch_pbd import (
 )
 from torch_pbd.data import make_tunnel_demonstrations
 from torch_pbd.kernels import correlation
-from torch_pbd.movement import time_kernel_fit
+from torch_pbd.movement import output_kernel, time_kernel_fit
 from torch_pbd.movement.time_kernel_fit import fit_time_kernel, smoothest_first
 
 GRID = np.linspace(0.0, 1.0, 30)
@@ -121,10 +121,10 @@ def test_the_law_is_that_of_the_dense_reference(recordings, monkeypatch):
     moments = regressor.predict(X, return_cov=True)
     mean, covariance, df, found = oracle.joint(GRID, demos, *moments, regressor.predict_df(X))
     # It has its own smallest nugget, and chooses the shrinkage as if that left the marginals what they are.
-    monkeypatch.setattr(time_kernel_fit, "_LEAST", min(oracle.NUGGETS))
-    monkeypatch.setattr(time_kernel_fit, "_NUGGETS", oracle.NUGGETS)
-    monkeypatch.setattr(time_kernel_fit, "_RATIOS", ())  # and one length scale, of its grid
-    monkeypatch.setattr(time_kernel_fit, "_BETWEEN", (1.0,))
+    monkeypatch.setattr(output_kernel, "_LEAST", min(oracle.NUGGETS))
+    monkeypatch.setattr(output_kernel, "_NUGGETS", oracle.NUGGETS)
+    monkeypatch.setattr(output_kernel, "_RATIOS", ())  # and one length scale, of its grid
+    monkeypatch.setattr(output_kernel, "_BETWEEN", (1.0,))
     own = TrajectoryRegressor(time_kernel="matern52", shrinkage=1.0 - found["weight"]).fit(X_fit, y, groups=groups)
     assert own.length_scale_ == pytest.approx(found["length"])
     assert own.df_ == max(3.0, 0.5 * df)
@@ -232,7 +232,7 @@ def test_a_movement_that_was_seen_halfway_is_foretold(recordings):
 
 
 def test_steps_that_a_recording_has_not_are_left_out_of_it_not_drawn_through(monkeypatch):
-    monkeypatch.setattr(time_kernel_fit, "_RATIOS", ())  # without tremor
+    monkeypatch.setattr(output_kernel, "_RATIOS", ())  # without tremor
     demos = movements(8)
     time = [GRID] * 7 + [np.delete(GRID, slice(8, 20))]
     hole = [*demos[:7], np.delete(demos[7], slice(8, 20), axis=0)]
@@ -255,7 +255,7 @@ def test_nuggets_take_missing_steps_for_missing():
 
 
 def test_the_length_scale_that_made_the_movements_is_found(monkeypatch):
-    monkeypatch.setattr(time_kernel_fit, "_RATIOS", ())  # without tremor
+    monkeypatch.setattr(output_kernel, "_RATIOS", ())  # without tremor
     found = found_kernel(sample_series("squared_exponential", 0.19, n_demos=30), "squared_exponential")
     assert found.scales[:, 0].tolist() == pytest.approx([0.19, 0.19], rel=0.02)  # those of the grid are 0.164 and 0.222
 
@@ -270,7 +270,7 @@ def test_the_likelier_kernel_is_that_of_the_movements(kernel):
 @pytest.mark.parametrize("kernel", ["squared_exponential", "matern52"])
 def test_a_step_of_noise_does_not_decide_on_the_kernel(kernel, seed, monkeypatch):
     """Where movements end at one point noise is left: one nugget for all steps would have to be as large."""
-    monkeypatch.setattr(time_kernel_fit, "_RATIOS", ())  # without tremor
+    monkeypatch.setattr(output_kernel, "_RATIOS", ())  # without tremor
     series = sample_series(kernel, 0.3, seed=seed)
     series[:, -1:] = torch.from_numpy(np.random.default_rng(seed).standard_normal((8, 1, 2)))
     assert found_kernel(series, "matern52", "squared_exponential").kernel == kernel
@@ -373,8 +373,8 @@ def test_large_demonstrations_widen_the_law_and_do_not_make_draws_of_all_rough(m
     demos[::5] = 4.0 * (demos[::5] + 0.05 * np.random.default_rng(0).standard_normal(demos[::5].shape))
     X, y, groups = stacked(demos)
     rough = []
-    for rounds in (2, 1):
-        monkeypatch.setattr(time_kernel_fit, "_FITS", rounds)
+    for even in (30.0, 0.0):  # with weights, and without
+        monkeypatch.setattr(time_kernel_fit, "_EVEN", even)
         model = TrajectoryRegressor(CholeskyCovRegressor()).fit(X, y, groups=groups)
         assert model.df_ < 8.0
         rough.append(np.median(np.square(np.diff(model.sample_demonstrations(X[:30], 500, 0), 2, axis=1)).mean((1, 2))))

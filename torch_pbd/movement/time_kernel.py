@@ -84,10 +84,9 @@ def smooth_correlation(
     slow = each[places[:, 0]]
     if not bool(fine.any()):
         return slow
-    # In place: these matrices are most of a fit's memory traffic.
-    own, their = (1.0 + fine).rsqrt()[..., None], (1.0 + other_fine).rsqrt()[..., None, :]
+    # In place, as memory traffic dominates.
     fast = each[places[:, 1]].mul_(fine.sqrt()[..., None] * other_fine.sqrt()[..., None, :])
-    return slow.add_(fast).mul_(own * their)
+    return slow.add_(fast).mul_((1.0 + fine).rsqrt()[..., None] * (1.0 + other_fine).rsqrt()[..., None, :])
 
 
 def _interpolated(grid: Float[Tensor, " T"], values: Float[Tensor, "*c T"], time: Float[Tensor, "*b n"]) -> Tensor:
