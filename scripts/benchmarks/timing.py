@@ -1,4 +1,4 @@
-"""Phase of running movements that were left out, after their first third: ``timing="warp"`` against the clock.
+"""Phase of running movements that were left out, after their first third: ``timing="warp"``, "auto" and the clock.
 
 The clock takes time over the mean duration for the phase. Two truths that no model has a part in: "place", where the
 recording is along the mean of the others, by dynamic time warping of the whole recording; and "share", of its own
@@ -65,6 +65,7 @@ def fold(name: str, left_out: int, retime: float) -> dict[str, Any]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warp = TrajectoryRegressor(timing="warp").fit(np.concatenate(times)[:, np.newaxis], y, groups=groups)
+        auto = TrajectoryRegressor(timing="auto").fit(np.concatenate(times)[:, np.newaxis], y, groups=groups)
         none = TrajectoryRegressor().fit(np.tile(share, len(times))[:, np.newaxis], y, groups=groups)
     fitted = time.process_time()
     known = warp.condition(X[seen], own[seen])
@@ -73,12 +74,15 @@ def fold(name: str, left_out: int, retime: float) -> dict[str, Any]:
     clock = np.minimum(X / average, 1.0 + 1e-6 * X)  # after the end it stands still
     rest = [known.predict(X[~seen]), none.condition(clock[seen], own[seen]).predict(clock[~seen])]
     errors = [float(np.sqrt(np.square(each - own[~seen]).mean())) for each in rest]
+    chosen = float(auto.condition(X[seen], own[seen]).predict_phase([[now]])[0][0])
     truth = place(own, np.mean(positions, axis=0), share[seen][-1])
     return {
         "set": name,
         "fold": left_out,
         "place_clock": abs(now / average - truth),
         "place_warp": abs(phase - truth),
+        "place_auto": abs(chosen - truth),
+        "auto_takes": auto.timing_,
         "share_clock": abs(now / average - share[seen][-1]),
         "share_warp": abs(phase - share[seen][-1]),
         "standardized": abs(phase - truth) / std if std > 0.0 else math.nan,  # where timing is not seen to vary
@@ -113,15 +117,18 @@ def main() -> None:
         rows.append(row)
         write(options.output / f"phases_{options.retime:g}.csv", rows)
     keys = [key for key in ("place", "share", "rest") if any(row[f"{key}_clock"] > 1e-9 for row in rows)]
-    print("| set | chosen on | " + " | ".join(f"{key}: clock | warp | change" for key in keys) + " | errors in sd |")
-    print("|" + " --- |" * (3 * len(keys) + 3))
+    cells = " | ".join(f"{key}: clock | warp | change" for key in keys)
+    print(
+        f"| set | chosen on | {cells} | errors in sd | place: auto | takes warp |\n|" + " --- |" * (3 * len(keys) + 5)
+    )
     for name in options.sets:
         own = [row for row in rows if row["set"] == name]
         usual = math.sqrt(np.nanmean([row["standardized"] ** 2 for row in own]))
         cells = " | ".join(difference(own, key) for key in keys)
-        print(f"| {name} | {'yes' if name in CHOSEN_ON else 'no'} | {cells} | {usual:.1f} |")
+        auto = f"{np.mean([row['place_auto'] for row in own]):.4f} | {sum(row['auto_takes'] == 'warp' for row in own)}"
+        print(f"| {name} | {'yes' if name in CHOSEN_ON else 'no'} | {cells} | {usual:.1f} | {auto} of {len(own)} |")
     seconds = [np.mean([row[f"{key}_seconds"] for row in rows]) for key in ("fit", "condition")]
-    print(f"CPU: both fits {seconds[0]:.2f} s, condition {seconds[1]:.2f} s")
+    print(f"CPU: the three fits {seconds[0]:.2f} s, condition {seconds[1]:.2f} s")
 
 
 if __name__ == "__main__":
