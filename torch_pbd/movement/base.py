@@ -1,12 +1,13 @@
 """Interface of the models of whole movements: fit, marginals, draws and scores from one joint law."""
 
+import copy
 import math
 from abc import abstractmethod
 from typing import Any, Self
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from sklearn.base import MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted
 
@@ -19,6 +20,8 @@ from torch_pbd.estimators.validation import checked_rows
 from torch_pbd.files.memory import require_much
 from torch_pbd.linalg import log_density
 from torch_pbd.movement.law import MovementLaw, as_recordings, semidefinite_root
+
+_STAMPS = 2.0  # durations of the longest demonstration that all may span: stamps of a clock span more
 
 
 class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
@@ -42,22 +45,33 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         Raises
         ------
         ValueError
-            If X has more than one column, y or groups are missing, there is only one demonstration, or a parameter
-            is invalid.
+            If X has more than one column, y or groups are missing, there is only one demonstration, all span twice
+            the longest, as stamps of a clock do, or a parameter is invalid.
         """
-        for name in ("_known", "_kept"):
-            self.__dict__.pop(name, None)
+        # Of a copy, so that a fit that fails leaves no mixture of two.
+        fitted = copy.copy(self)
+        fitted.__dict__.pop("_known", None)
+        fitted._fit_recordings(as_recordings(fitted, X, y, groups, is_fit=True))
+        self.__dict__ = fitted.__dict__
+        return self
+
+    def _fit_recordings(self, recordings: list[Demonstration]) -> None:
         self._check_parameters()
-        recordings = as_recordings(self, X, y, groups, is_fit=True)
         if len(recordings) < 2:
             raise ValueError(
                 "groups has one demonstration, must have two or more: how whole movements differ is not seen in one. "
                 "Record more, or use a covariance regressor by itself."
             )
-        times = np.concatenate([time for time, _ in recordings])
-        self._range = float(times.min()), checks.number(float(np.ptp(times)), "the range of X", above=0.0)
+        times = [time for time, _ in recordings]
+        low, width = float(np.concatenate(times).min()), float(np.ptp(np.concatenate(times)))
+        self._range = low, checks.number(width, "the range of X", above=0.0)
+        longest = max(map(np.ptp, times))
+        if width > _STAMPS * longest:
+            raise ValueError(
+                f"X spans {width:.6g}, but no demonstration more than {longest:.6g}: they would be parts of one long "
+                "movement. Count the times of each from its own start, or give its phase from 0 to 1."
+            )
         self._fit(recordings)
-        return self
 
     @abstractmethod
     def _check_parameters(self) -> None:
@@ -113,8 +127,8 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
     def predict_uncertainty(self, X: ArrayLike) -> Uncertainty:
         """Missing data (``type1``) and variability (``type2``) at X, separately (Section IV-C).
 
-        ``type1`` is that of the regressor; basis functions cannot detect missing data and have 0 within the times of
-        the fit and 1 beyond them. ``type2`` is the variability given observations.
+        ``type1`` is the regressor's for TrajectoryRegressor; the baselines cannot detect missing data and have 0 within
+        the times of the fit and 1 beyond them. ``type2`` is the variability given observations.
         """
         weight, parts = self._components(self._times(X))
         mean, type1, type2 = zip(*(by_chunks(law._uncertainty, own) for law, own in parts), strict=True)
@@ -191,25 +205,42 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         ndarray of shape (n_samples_X, n_outputs, n_samples), or (n_samples_X, n_samples) if y was 1-D
         """
         checks.count(n_samples, "n_samples")
-        generator = checks.seed(random_state)
-        mean, covariance = self._marginals(self._times(X))
-        deviation = semidefinite_root(covariance) @ generator.standard_normal((*mean.shape, n_samples))
-        degrees = self.predict_df(X)[:, np.newaxis, np.newaxis]
-        if np.isfinite(degrees).all():
-            deviation *= np.sqrt((degrees - 2.0) / generator.chisquare(degrees, (len(mean), 1, n_samples)))
-        samples = mean[:, :, np.newaxis] + deviation
+        generator, time = checks.seed(random_state), self._times(X)
+        weight, parts = self._components(time)
+        samples = np.empty((len(time), self.n_outputs_, n_samples))
+        drawn = generator.choice(len(weight), (len(time), n_samples), p=weight)
+        for number, (law, own) in enumerate(parts):
+            mean, covariance = by_chunks(law._rows, own)
+            degrees, (rows, columns) = law.predict_df(own[:, np.newaxis]), (drawn == number).nonzero()
+            normal = generator.standard_normal((len(rows), self.n_outputs_, 1))
+            deviation = (semidefinite_root(covariance)[rows] @ normal)[..., 0]
+            if np.isfinite(degrees).all():
+                degrees = degrees[rows]
+                deviation *= np.sqrt((degrees - 2.0) / generator.chisquare(degrees))[:, np.newaxis]
+            samples[rows, :, columns] = mean[rows] + deviation
         return samples[:, 0] if self._y_is_1d else samples
 
     def log_likelihood(self, X: ArrayLike, y: ArrayLike) -> Floats:
         """Marginal log density (n_samples,) of each row of y at X, in nats."""
         check_is_fitted(self)
         X, targets = checked_rows(self, X, y, reset=False)
-        mean, covariance = map(torch.from_numpy, self._marginals(self._times(X)))
-        root, info = torch.linalg.cholesky_ex(covariance)
-        if info.any():
-            raise ValueError("X has a row that is known without noise: it has no density. Leave it out.")
-        residual, degrees = torch.from_numpy(targets).reshape(mean.shape) - mean, torch.from_numpy(self.predict_df(X))
-        return log_density(residual, root, degrees if degrees.isfinite().all() else None).numpy()
+        if targets[0].size != self.n_outputs_:
+            raise ValueError(f"y has {targets[0].size} outputs, but the model was fitted with {self.n_outputs_}.")
+        time = self._times(X)
+        weight, parts = self._components(time)
+        values = [torch.tensor(weight).log()[:, None]]
+        for law, own in parts:
+            if law._is_known(own).any():
+                raise ValueError("X has a row that is known without noise: it has no density. Leave it out.")
+            mean, covariance = map(torch.from_numpy, by_chunks(law._rows, own))
+            degrees = torch.from_numpy(law.predict_df(own[:, np.newaxis]))
+            residual, root = torch.from_numpy(targets.reshape(mean.shape)) - mean, torch.linalg.cholesky(covariance)
+            values.append(log_density(residual, root, degrees if degrees.isfinite().all() else None)[None])
+        return (values[0] + torch.cat(values[1:])).logsumexp(0).numpy()
+
+    def _is_known(self, time: Floats) -> NDArray[np.bool_]:
+        """Whether an output is known without noise at each of these times: there is no density there."""
+        return np.isin(self._rounded(time), self._rounded(self._known.time[self._known.exact.any(axis=1)]))
 
     def score_demonstrations(self, X: Any, y: ArrayLike | None = None, *, groups: ArrayLike | None = None) -> Floats:
         """Joint log density of each demonstration, in nats, given the observations of :meth:`condition`.
@@ -239,17 +270,17 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         """Joint log density of the demonstrations per step, in nats: higher is better; pipelines pass the None."""
         if sample_weight is not None:
             raise checks.refusal(sample_weight, "sample_weight", "None", "weigh what score_demonstrations returns")
+        check_is_fitted(self)
         recordings = as_recordings(self, X, y, groups, is_fit=False)
         return float(sum(self._score(*each) for each in recordings) / sum(len(each.time) for each in recordings))
 
     def _score(self, time: Floats, position: Floats) -> float:
         """Joint log density of one demonstration."""
         # A step that is known or repeated has no variance left, and so no density.
-        own, known = self._rounded(time), self._rounded(self._known.time[self._known.exact.any(axis=1)])
-        if len(np.unique(own)) < len(own) or np.isin(own, known).any():
+        if len(np.unique(self._rounded(time))) < len(time) or self._is_known(time).any():
             raise ValueError(
                 "X has a time twice in a demonstration, or one that is known without noise: leave it out, the movement "
-                "has no density there."
+                "has no density there; give groups if there are several demonstrations."
             )
         conditioned, rows = self._conditioned(time)
         return conditioned.law.at(rows).log_density(torch.from_numpy(position), self.df_)
@@ -264,3 +295,9 @@ def mixed(weight: Floats, moments: list[tuple[Floats, Floats]], outer: str) -> t
     whole = np.tensordot(weight, mean, 1)
     deviation = np.sqrt(weight)[:, np.newaxis, np.newaxis] * (mean - whole)
     return whole, np.tensordot(weight, covariance, 1) + np.einsum(outer, deviation, deviation)
+
+
+def check_regressor(regressor: Any) -> None:
+    """Check that a parameter is None or an estimator of mean and covariance."""
+    if regressor is not None and (isinstance(regressor, type) or not hasattr(regressor, "predict_df")):
+        raise checks.refusal(regressor, "regressor", "a covariance regressor or None")

@@ -174,7 +174,7 @@ class Conditioned:
         half = half.flatten(0, 1)
         self._precision_root = torch.linalg.cholesky(half.mT @ half + torch.eye(half.shape[1]).to(half))
         self._open = law.loadings - (self._gain @ loadings).transpose(0, 1)
-        left = torch.linalg.solve_triangular(self._precision_root.mT, self._open, upper=True, left=False)
+        left = _over_root(self._open, self._precision_root)
         # What is known has no variance, not even of rounding, which may be below zero.
         return replace(law, factor=law.factor.index_fill(0, self._steps, 0.0), loadings=left, taken=taken)
 
@@ -189,8 +189,7 @@ class Conditioned:
         self._columns = law.factor @ inner
         own = torch.einsum("pd,pdq->pq", directions, self._columns[steps]) + self._entry_noise.square().diag()
         self._entry_root = safe_cholesky(symmetrize(own), name="the covariance of the entries given")
-        explained = torch.linalg.solve_triangular(self._entry_root.mT, self._columns, upper=True, left=False)
-        return replace(law, explained=explained)
+        return replace(law, explained=_over_root(self._columns, self._entry_root))
 
     def deviations(self, n_draws: int, normal: Callable[[tuple[int, int]], Tensor]) -> Float[Tensor, "s n d"]:
         """Draws of the deviation from the mean; ``normal`` gives standard normal numbers of a requested shape.
@@ -221,3 +220,8 @@ class Conditioned:
             return x
         errors = entries - (self._directions * x[:, self._entry_steps]).sum(-1)
         return x + torch.einsum("ndp,ps->snd", self._columns, torch.cholesky_solve(errors.mT, self._entry_root))
+
+
+def _over_root(rows: Float[Tensor, "n d p"], root: Float[Tensor, "p p"]) -> Float[Tensor, "n d p"]:
+    """Rows times the inverse transpose of a lower factor, of all steps at once: batches would repeat it for each."""
+    return torch.linalg.solve_triangular(root.mT, rows.flatten(0, 1), upper=True, left=False).reshape(rows.shape)

@@ -16,7 +16,7 @@ from torch_pbd.estimators.door import Standardization
 from torch_pbd.estimators.mixture import GMMBaseline
 from torch_pbd.estimators.validation import fit_with_groups
 from torch_pbd.files.memory import require_much
-from torch_pbd.movement.base import MovementRegressor
+from torch_pbd.movement.base import MovementRegressor, check_regressor
 from torch_pbd.movement.joint import Conditioned, JointNormal
 from torch_pbd.movement.law import as_rows, check_arrays, semidefinite_root
 
@@ -31,8 +31,9 @@ class KMPBaseline(MovementRegressor):
     With the reference's means mu_i and covariances S_i at N times, block diagonal S, the mean at t is
     ``k_t (K + lambda_mean S)^-1 mu`` and the covariance between t and t' is
     ``N / lambda_cov (k(t, t') I - k_t (K + lambda_cov S)^-1 k_t')``, of standardized outputs, since the kernel's
-    variance is 1 and the mean returns to 0 far from the reference. Via points replace the nearest points of the
-    reference, as in the reference paper; this is not the law of a conditioned movement, and passes them nearly.
+    variance is 1 and the mean returns to 0 far from the reference. Via points are added to the reference, or replace
+    its points that are nearer than half their spacing, as in the reference paper; this is not the law of a conditioned
+    movement, and passes them nearly.
 
     Parameters
     ----------
@@ -79,6 +80,7 @@ class KMPBaseline(MovementRegressor):
         for name in ("length_scale", "lambda_mean", "lambda_cov", "nugget"):
             checks.number(getattr(self, name), name, above=0.0)
         checks.seed(self.random_state)
+        check_regressor(self.regressor)
 
     def _fit(self, recordings: list[Demonstration]) -> None:
         X, y, groups = as_rows(recordings)
@@ -142,22 +144,26 @@ class KMPBaseline(MovementRegressor):
         return np.asarray(np.exp(-0.5 * np.square(difference / self.length_scale)))
 
     def _with_via_points(self) -> tuple[Floats, Floats, Floats]:
-        """Standardized reference, nearest times replaced by the via points; outputs that are not given stay."""
+        """Standardized reference with via points, in place of times that are near; outputs that are not given stay."""
         if not len(self._known.time):
             return self._reference
         axes, shift = self._observed_axes * self._scale, self._observed_axes @ self._shift
-        time, means = self._reference[0].copy(), self._reference[1] @ axes.T
-        covariances = axes @ self._reference[2] @ axes.T
+        reference, means, covariances = self._reference
         least = _LEAST * np.square(axes).sum(axis=1)
-        for at, value, noise in zip(*self._known, strict=True):
-            nearest = int(np.abs(self._reference[0] - at).argmin())
+        distance = np.abs(self._known.time[:, np.newaxis] - reference)
+        nearest = distance.argmin(axis=1)
+        place, spread = means[nearest] @ axes.T, axes @ covariances[nearest] @ axes.T
+        for mean, covariance, value, noise in zip(place, spread, *self._known[1:], strict=True):
             given = ~np.isnan(value)
-            time[nearest] = at
-            means[nearest, given] = (value - shift)[given]
-            covariances[nearest][given] = covariances[nearest][:, given] = 0.0
-            covariances[nearest][given, given] = np.maximum(np.square(noise), least)[given]
+            mean[given] = (value - shift)[given]
+            covariance[given] = covariance[:, given] = 0.0
+            covariance[given, given] = np.maximum(np.square(noise), least)[given]
         back = np.linalg.inv(axes)
-        return time, means @ back.T, back @ covariances @ back.T
+        is_near = distance.min(axis=1) <= (0.5 + checks.ROUNDING) * (reference[1] - reference[0])
+        kept = np.setdiff1d(np.arange(len(reference)), nearest[is_near])
+        pairs = (reference, self._known.time), (means, place @ back.T), (covariances, back @ spread @ back.T)
+        time, means, covariances = (np.concatenate([old[kept], new]) for old, new in pairs)
+        return time, means, covariances
 
     def _conditioned(self, time: Floats) -> tuple[Conditioned, torch.Tensor]:
         # Via points are in the reference, so nothing is conditioned on.

@@ -24,7 +24,7 @@ _MOST_ENTRIES = 4096  # most entries conditioned on one by one: a matrix of thei
 
 
 class Known(NamedTuple):
-    """Observations of a movement: times (m,), values (m, d) with NaN where not given, and noise (m, d)."""
+    """Observations of a movement: times (m,), values (m, d) along axes, NaN where not given, and noise (m, d)."""
 
     time: Floats
     value: Floats
@@ -36,7 +36,10 @@ class Known(NamedTuple):
         return Known(*(np.concatenate([own.reshape(-1, *new.shape[1:]), new]) for own, new in pairs))
 
     def joined(self, rounded: Floats) -> "Known":
-        """Those at one of the ``rounded`` times as one, if no entry is given twice: known one by one, all are known."""
+        """Those at one of the ``rounded`` times in one row, unless an entry is given twice.
+
+        A step whose outputs came one by one is then conditioned on as a whole.
+        """
         _, first, place = np.unique(rounded, return_index=True, return_inverse=True)
         rows, outputs = (~np.isnan(self.value)).nonzero()
         if len(first) == len(rounded) or len(np.unique(np.stack([place[rows], outputs]), axis=1).T) < len(rows):
@@ -99,7 +102,8 @@ class MovementLaw(BaseEstimator, ABC):
     def condition(self, X: ArrayLike, y: ArrayLike, *, noise_scale: ArrayLike = 0.0) -> Self:
         """Fitted copy, conditioned on passing y at X: a start, a goal, via points or the part observed so far.
 
-        The normal formulas apply to the joint covariance; the degrees of freedom stay. A copy can be conditioned again.
+        The normal formulas apply to the joint covariance; the degrees of freedom stay. A copy can be conditioned again
+        and pickled, but not saved in a model file.
 
         Parameters
         ----------
@@ -184,12 +188,12 @@ class MovementLaw(BaseEstimator, ABC):
             return law, np.arange(len(time))
         if 2 * len(old) < len(last):
             last, law, place = last[place], law.at(torch.from_numpy(place)), np.arange(len(place))
-        new = np.delete(time, old)
-        if len(new):
-            law = law.joined(self._prior(new), self._between(last, new))
         index = np.full(len(time), -1)
         index[old] = place
-        index[index < 0] = len(last) + np.arange(len(new))
+        new = time[index < 0]
+        if len(new):
+            law = law.joined(self._prior(new), self._between(last, new))
+            index[index < 0] = len(last) + np.arange(len(new))
         return law, index
 
     def _copy(self) -> Self:

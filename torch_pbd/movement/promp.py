@@ -37,10 +37,11 @@ class ProMPBaseline(MovementRegressor):
     Parameters
     ----------
     n_basis : int or "auto", default="auto"
-        Number of bases; "auto" takes 8 to 20 by the likelihood of demonstrations left out in turn.
+        Number of bases, at most one less than the samples of each demonstration; "auto" takes 8 to 20 by the likelihood
+        of demonstrations left out in turn.
     overlap : float or "auto", default="auto"
-        Value of a basis, before normalization, midway to its neighbour's centre, 0 to 1; "auto" takes 0.7, 0.85 or 0.92
-        by the same likelihood.
+        About the value of a basis, before normalization, midway to its neighbour's centre, 0 to 1: it is this to the
+        power ``(n_basis / (n_basis - 1))**2``. "auto" takes 0.7, 0.85 or 0.92 by the same likelihood.
     ridge : float, default=1e-6
         Ridge of the regression of the weights, relative to the mean diagonal of its matrix.
     shrinkage : float or "auto", default="auto"
@@ -181,7 +182,9 @@ class _Weights:
 
 def _ridge_weights(bases: Floats, position: Floats, *, ridge: float) -> Floats:
     gram = bases.T @ bases
-    return np.linalg.solve(gram + ridge * gram.trace() / len(gram) * np.eye(len(gram)), bases.T @ position)
+    # Without a ridge, weights of which a recording shows nothing are 0.
+    matrix = gram + ridge * gram.trace() / len(gram) * np.eye(len(gram))
+    return np.asarray(np.linalg.lstsq(matrix, bases.T @ position, rcond=None)[0])
 
 
 def basis_functions(time: Floats, n_basis: int, overlap: float) -> Floats:

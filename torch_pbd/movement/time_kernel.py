@@ -46,7 +46,11 @@ class TimeKernel(nn.Module):
         self.kernel = kernel
         for name, value in buffers.items():
             self.register_buffer(name, value)
-        # Kernel weights of the smooth parts of all residuals, and the remainders of these: (d, T, K).
+        self._weigh()
+        self.register_load_state_dict_post_hook(TimeKernel._weigh)
+
+    def _weigh(self, *_: object) -> None:
+        """Kernel weights of the smooth parts of all residuals, and the remainders of these: (d, T, K)."""
         rows, own = self.residual.permute(2, 1, 0), self._correlation(self.grid, self.grid)
         root = safe_cholesky(own + torch.diag_embed(self.nugget), name="the time kernel")
         self.register_buffer("_weights", torch.cholesky_solve(rows, root), persistent=False)

@@ -61,6 +61,12 @@ class TimedMovement(MovementRegressor):
         mean = weight @ phase
         return mean, np.sqrt(weight @ np.square(phase - mean))
 
+    def _times(self, X: ArrayLike) -> Floats:
+        time = super()._times(X)
+        if self._timing is not None and (time < -checks.ROUNDING).any():
+            raise ValueError(f"X has a time of {time.min():.6g}, must be at least 0: count from the movement's start.")
+        return time
+
     def condition(self, X: ArrayLike, y: ArrayLike, *, noise_scale: ArrayLike = 0.0) -> Self:
         """Fitted copy, conditioned on passing y at X; see ``MovementRegressor.condition``.
 
@@ -104,10 +110,10 @@ class TimedMovement(MovementRegressor):
 
         return self._log_density(self._known.and_also(time, position, np.zeros_like(position)), exact)
 
-    def _log_density(self, whole: Known, exact: Likelihood | None = None) -> float:
+    def _log_density(self, whole: Known, exact: Likelihood | None = None, duration: float | None = None) -> float:
         """Log density of what goes beyond the observations: its mean over movements that run to the end of it."""
         last = self._last(whole.time)
-        over = self._timing.posterior(self._log_likelihood(whole), last, exact=exact).log_integral
+        over = self._timing.posterior(self._log_likelihood(whole, duration), last, exact=exact).log_integral
         return float(over - self._timing.posterior(self._log_likelihood(self._known), last).log_integral)
 
     def _last(self, time: Floats) -> float:
@@ -119,9 +125,9 @@ class TimedMovement(MovementRegressor):
             )
         return min(last, longest)
 
-    def _log_likelihood(self, known: Known) -> Likelihood:
+    def _log_likelihood(self, known: Known, duration: float | None = None) -> Likelihood:
         """Log density of what is known, at samples a twelfth of a movement apart, given durations and paces."""
-        rows = _spread(known.time, float(self._timing.location[0].exp()))
+        rows = _spread(known.time, duration or float(self._timing.location[0].exp()))
         time, value, noise = (torch.from_numpy(each[rows]) for each in known)
         given = ~value.flatten().isnan()
         if not bool(given.any()):
@@ -183,7 +189,8 @@ class TimedMovement(MovementRegressor):
 
         Steps are a twelfth of a movement apart, as long as the movement runs under both.
         """
-        n_folds, mean = min(_MOST_FOLDS, len(recordings)), np.mean([recording.time[-1] for recording in recordings])
+        n_folds = min(_MOST_FOLDS, len(recordings))
+        mean = float(np.mean([recording.time[-1] for recording in recordings]))
         gain, n_steps = 0.0, 0
         for fold in range(n_folds):
             train = [recording for number, recording in enumerate(recordings) if number % n_folds != fold]
@@ -193,8 +200,8 @@ class TimedMovement(MovementRegressor):
             for time, position in recordings[fold::n_folds]:
                 seen = time <= min(mean, warp._timing.longest(), none._timing.longest())
                 known = Known(time[seen], position[seen], np.zeros_like(position[seen]))
-                gain += warp._log_density(known) - none._log_density(known)
-                n_steps += len(_spread(known.time, float(mean)))
+                gain += warp._log_density(known, duration=mean) - none._log_density(known, duration=mean)
+                n_steps += len(_spread(known.time, mean))
         return gain / n_steps
 
     def _timing_arrays(self) -> dict[str, Floats]:

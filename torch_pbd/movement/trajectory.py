@@ -19,6 +19,7 @@ from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
 from torch_pbd.estimators.validation import fit_with_groups
 from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import safe_cholesky
+from torch_pbd.movement.base import check_regressor
 from torch_pbd.movement.joint import JointNormal
 from torch_pbd.movement.law import as_rows, check_arrays
 from torch_pbd.movement.time_kernel import TimeKernel
@@ -170,16 +171,14 @@ class TrajectoryRegressor(TimedMovement):
             checks.number(self.shrinkage, "shrinkage", least=0.0, most=0.95)
         checks.choice(self.timing, "timing", ("none", "warp", "auto"))
         checks.seed(self.random_state)
-        if self.regressor is not None and (
-            isinstance(self.regressor, type) or not hasattr(self.regressor, "predict_cov")
-        ):
-            raise checks.refusal(self.regressor, "regressor", "a covariance regressor or None")
+        check_regressor(self.regressor)
 
     def _fit(self, recordings: list[Demonstration]) -> None:
         for number, recording in enumerate(recordings):
             if len(recording.time) < 2 or not (np.diff(recording.time) > 0.0).all():
                 raise ValueError(
-                    f"X has a time twice in demonstration {number}, or fewer than two: its samples must be in a row."
+                    f"X has a time twice in demonstration {number}, or only one: it must have two samples or more, at "
+                    "different times."
                 )
         self._fit_law(self._timed(recordings))
 
@@ -218,12 +217,12 @@ class TrajectoryRegressor(TimedMovement):
         """Prediction of the regressor, or after :meth:`condition` mean and covariance of the rest of the movement."""
         if not self._is_regressor:
             return super().predict(X, return_std=return_std, return_cov=return_cov)
-        self._times(X)
-        return self.regressor_.predict(X, return_std=return_std, return_cov=return_cov)
+        return self.regressor_.predict(self._times(X)[:, np.newaxis], return_std=return_std, return_cov=return_cov)
 
     def predict_df(self, X: ArrayLike) -> Floats:
         """Degrees of freedom (n_samples,) of the marginals, or of the joint law after :meth:`condition`."""
-        return self.regressor_.predict_df(X) if self._is_regressor else super().predict_df(X)
+        time = self._times(X)[:, np.newaxis]
+        return self.regressor_.predict_df(time) if self._is_regressor else super().predict_df(time)
 
     @property
     def _is_regressor(self) -> bool:
