@@ -7,8 +7,9 @@ import pytest
 import sklearn
 from lc_ns_kmp import LC_NS_KMP
 from movement_primitives.promp import ProMP
-from scipy.stats import multivariate_normal
+from scipy.stats import multivariate_normal, multivariate_t
 from sklearn.base import clone
+from sklearn.exceptions import NotFittedError
 from sklearn.model_selection import GroupKFold, cross_val_score
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import MinMaxScaler
@@ -127,6 +128,20 @@ def test_kmp_passes_its_via_points_and_keeps_the_outputs_that_are_not_given():
     np.testing.assert_array_equal(model.predict([[0.5]])[0], before)
 
 
+def test_kmp_keeps_all_that_is_known_where_the_reference_has_one_time():
+    model = fit(KMPBaseline(), movements(8))
+    near = np.array([[0.502], [0.503]])
+    value = model.predict(near) + np.array([[0.02], [0.03]])
+    np.testing.assert_allclose(model.condition(near, value).predict(near), value, atol=0.004)
+    # What is known exactly is not forgotten for a later, worthless observation.
+    known = model.condition(near[:1], value[:1])
+    worthless = known.condition(near[:1], [[0.9, 0.9]], noise_scale=10.0)
+    np.testing.assert_allclose(worthless.predict(X), known.predict(X), atol=1e-3)
+    # Nor is the reference's end for a point beyond it.
+    end, beyond = np.array([[1.0]]), model.condition([[5.0]], [[0.0, 0.0]])
+    np.testing.assert_allclose(beyond.predict_cov(end), model.predict_cov(end), rtol=1e-6)
+
+
 @pytest.mark.parametrize("make", [ProMPBaseline, KMPBaseline])
 @pytest.mark.parametrize(("unit", "origin"), [(1e3, 0.0), (1e-6, 0.0), (1.0, 100.0), ([1e3, 1e-2], [0.0, -70.0])])
 def test_units_and_origins_of_outputs_decide_nothing(make, unit, origin):
@@ -156,7 +171,8 @@ def test_promp_takes_what_a_recording_that_ends_early_does_not_show_from_the_oth
     with pytest.warns(DataRankWarning, match="The demonstrations are identical: their covariance is zero"):
         model.fit(inputs, y, groups=groups)
     partial.fit(inputs[seen], y[seen], groups=groups[seen])
-    for each in (model, partial):
+    once_more = ProMPBaseline(n_basis=8, overlap=0.7, ridge=0.0).fit(inputs[seen], y[seen], groups=groups[seen])
+    for each in (model, partial, once_more):
         np.testing.assert_allclose(each.predict(X), once, atol=1e-3)
 
 
@@ -228,6 +244,46 @@ def test_baselines_have_the_methods_of_a_movement(make):
 
 
 @pytest.mark.parametrize("make", [TrajectoryRegressor, ProMPBaseline, KMPBaseline])
+def test_a_fit_that_fails_leaves_what_was_fitted(make):
+    model, (inputs, y, groups) = fit(make(), movements(6)), stacked(movements(6))
+    before = model.condition([[0.5]], [[0.3, 0.3]]).predict(X)
+    with pytest.raises(ValueError, match="groups has one demonstration"):
+        model.fit(inputs[:30], np.repeat(y[:30], 2, axis=1), groups=groups[:30])
+    with pytest.raises(ValueError, match=r"X spans 303, but no demonstration more than 1: .* from its own start"):
+        model.fit(inputs + 60.4 * groups[:, np.newaxis], y, groups=groups)  # stamps of a clock
+    np.testing.assert_array_equal(model.condition([[0.5]], [[0.3, 0.3]]).predict(X), before)
+    assert not make()._known.time.size
+    with pytest.raises(NotFittedError):
+        make().score(inputs, y, groups=groups)
+
+
+@pytest.mark.parametrize("make", [TrajectoryRegressor, ProMPBaseline])
+def test_a_row_of_which_an_output_is_known_has_no_density_whatever_rounding_leaves(make):
+    model = fit(make(), movements(6))
+    for at in np.linspace(0.01, 0.99, 15):
+        known = model.condition([[at]], [[0.9, np.nan]])
+        for score in (known.log_likelihood, known.score_demonstrations):
+            with pytest.raises(ValueError, match="known without noise"):
+                score([[at]], [[0.9, 0.4]])
+
+
+@pytest.mark.parametrize("make", [TrajectoryRegressor, ProMPBaseline])
+def test_single_rows_are_drawn_and_scored_by_their_law(make):
+    model = fit(make(), movements(6)).condition([[0.3]], [[0.5, 0.5]])
+    at, y = np.array([[0.6]]), np.array([[0.2, 0.7]])
+    mean, covariance = (part[0] for part in model.predict(at, return_cov=True))
+    df = model.predict_df(at)[0]
+    law = multivariate_t(mean, covariance * (df - 2.0) / df, df) if np.isfinite(df) else None
+    law = law or multivariate_normal(mean, covariance)
+    assert model.log_likelihood(at, y)[0] == pytest.approx(law.logpdf(y[0]), rel=1e-9)
+    drawn = model.sample_y(at, 100_000, random_state=0)[0]
+    np.testing.assert_allclose(np.cov(drawn), covariance, rtol=0.1, atol=0.05 * covariance.max())
+    edges = [0.001, 0.01, 0.99, 0.999]
+    own = np.quantile(law.rvs(100_000, random_state=1)[:, 0], edges)
+    np.testing.assert_allclose(np.quantile(drawn[0], edges), own, atol=0.3 * covariance[0, 0] ** 0.5)
+
+
+@pytest.mark.parametrize("make", [TrajectoryRegressor, ProMPBaseline, KMPBaseline])
 def test_no_rows_have_a_law_and_draws_too(make):
     model, none = fit(make(), movements(6)), np.empty((0, 1))
     for law in (model, model.condition([[0.5]], [[0.1, np.nan]])):
@@ -252,6 +308,7 @@ def test_promp_is_conditioned_by_the_normal_formulas():
         (ProMPBaseline(overlap=1.0), "overlap is 1.0, must be a finite number above 0 and below 1"),
         (ProMPBaseline(shrinkage=-0.1), "shrinkage is -0.1, must be a finite number of at least 0"),
         (KMPBaseline(lambda_cov=0.0), "lambda_cov is 0.0, must be a finite number above 0"),
+        (KMPBaseline("HGP"), "regressor is 'HGP', must be a covariance regressor or None"),
     ],
 )
 def test_parameters_are_checked(model, message):

@@ -233,6 +233,20 @@ def test_auto_takes_timing_where_left_out_demonstrations_have_it(shown):
     np.testing.assert_allclose(none.predict_phase([[0.5], [2.0]]), [[0.25, 1.0], [0.0, 0.0]], atol=1e-12)
 
 
+def test_single_rows_have_the_law_of_the_mixture(model):
+    """Once a Student's t of the mixture's moments was taken, whose tails are others."""
+    late = np.array([[1.9]])
+    mean, std = model.predict(late, return_std=True)
+    rows = mean + std * np.array([[0.0, 0.0], [1.0, -0.5], [4.0, 4.0]])
+    own = [model.score_demonstrations(late, row[np.newaxis])[0] for row in rows]
+    found = [model.log_likelihood(late, row[np.newaxis])[0] for row in rows]
+    np.testing.assert_allclose(found, own)
+    drawn = model.sample_y(late, 40_000, random_state=0)[0]
+    np.testing.assert_allclose(np.cov(drawn), model.predict_cov(late)[0], rtol=0.08, atol=0.02 * std.max() ** 2)
+    x = np.sort(model.sample_demonstrations(late, 40_000, random_state=1)[:, 0, 0])
+    np.testing.assert_allclose(np.quantile(drawn[0], [0.01, 0.5, 0.99]), np.quantile(x, [0.01, 0.5, 0.99]), atol=0.03)
+
+
 def test_without_timing_nothing_changes(shown):
     plain, named = (
         TrajectoryRegressor(GMMBaseline(n_restarts=0), **own).fit(shown) for own in ({}, {"timing": "none"})
@@ -277,6 +291,8 @@ def test_what_timing_cannot_do_is_refused(shown, model):
         ValueError, match=r"X reaches 50, must be at most .*: no movement like those shown lasts longer"
     ):
         model.condition([[50.0]], [[0.0, 0.0]])
+    with pytest.raises(ValueError, match="X has a time of -0.5, must be at least 0: count from the movement's start"):
+        model.predict([[-0.5]])
     with pytest.raises(ValueError, match="timing of covariance is 'warp', must be 'none'"):
         DMPController(TrajectoryRegressor(timing="warp")).fit(shown)
 

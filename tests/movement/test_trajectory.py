@@ -5,6 +5,7 @@ import importlib.util
 import pickle
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from scipy.linalg import block_diag
@@ -47,7 +48,7 @@ def stacked(demos, grid=GRID):
 @pytest.fixture(scope="module")
 def model():
     X, y, groups = stacked(movements())
-    return TrajectoryRegressor().fit(X, y, groups=groups)
+    return TrajectoryRegressor(shrinkage=0.4).fit(X, y, groups=groups)
 
 
 def sample_series(kernel, length_scale, n_demos=8, seed=3):
@@ -388,6 +389,36 @@ def test_the_module_is_differentiable_and_the_law_of_the_estimator(model):
     assert torch.autograd.gradcheck(lambda t: model.module_(t)[1], x, atol=1e-6)
     mean.sum().backward()
     assert torch.isfinite(x.grad).all()
+
+
+def test_a_state_is_the_whole_module(model):
+    X, y, groups = stacked(movements(seed=5))
+    other = TrajectoryRegressor(shrinkage=0.4).fit(X, y, groups=groups).module_
+    loaded = copy.deepcopy(model.module_)
+    loaded.load_state_dict(other.state_dict())
+    x = torch.tensor([[0.1], [0.5]], dtype=torch.float64)
+    torch.testing.assert_close(loaded(x)[1], other(x)[1])
+
+
+def test_many_noisy_observations_do_not_take_memory_for_each_step(model):
+    """A factor of all entries was once repeated for each step: 30 GB here."""
+    X, noise = np.linspace(0.0, 0.5, 1000)[:, np.newaxis], 1e-2
+    known = model.condition(X, model.predict(X), noise_scale=noise)
+    np.testing.assert_allclose(known.predict([[0.2], [0.4]]), model.predict([[0.2], [0.4]]), atol=1e-9)
+    assert (known.predict_cov([[0.2]])[0].diagonal() < noise**2 + model.nugget_scale_.max() ** 2).all()
+
+
+@pytest.mark.filterwarnings("error")
+def test_names_of_columns_and_rounded_phases_say_nothing():
+    X, y, groups = stacked(movements())
+    frame = pd.DataFrame({"time": X[:, 0]})
+    model = TrajectoryRegressor(CholeskyCovRegressor()).fit(frame, y, groups=groups)
+    model.predict(frame), model.predict_df(frame)
+    # Phases of recordings of several lengths are equal but for rounding.
+    times = [np.linspace(0.0, duration, 31) for duration in (1.1, 1.3, 0.7, 1.7, 2.3)]
+    times[0] = np.delete(times[0], [12, 13, 14])
+    places = [np.sin(3.0 * time / time[-1])[:, np.newaxis] + 0.1 * k for k, time in enumerate(times)]
+    TrajectoryRegressor(CholeskyCovRegressor()).fit(Demonstrations(times, places))
 
 
 def test_it_is_an_estimator(model):

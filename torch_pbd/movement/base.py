@@ -226,17 +226,16 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         X, targets = checked_rows(self, X, y, reset=False)
         if targets[0].size != self.n_outputs_:
             raise ValueError(f"y has {targets[0].size} outputs, but the model was fitted with {self.n_outputs_}.")
-        time = self._times(X)
-        weight, parts = self._components(time)
-        values = [torch.tensor(weight).log()[:, None]]
-        for law, own in parts:
-            if law._is_known(own).any():
-                raise ValueError("X has a row that is known without noise: it has no density. Leave it out.")
-            mean, covariance = map(torch.from_numpy, by_chunks(law._rows, own))
-            degrees = torch.from_numpy(law.predict_df(own[:, np.newaxis]))
-            residual, root = torch.from_numpy(targets.reshape(mean.shape)) - mean, torch.linalg.cholesky(covariance)
-            values.append(log_density(residual, root, degrees if degrees.isfinite().all() else None)[None])
-        return (values[0] + torch.cat(values[1:])).logsumexp(0).numpy()
+        return self._row_scores(self._times(X), targets.reshape(len(X), -1))
+
+    def _row_scores(self, time: Floats, position: Floats) -> Floats:
+        """Log density of each row by itself."""
+        if self._is_known(time).any():
+            raise ValueError("X has a row that is known without noise: it has no density. Leave it out.")
+        mean, covariance = map(torch.from_numpy, self._marginals(time))
+        degrees = torch.from_numpy(self.predict_df(time[:, np.newaxis]))
+        residual, root = torch.from_numpy(position) - mean, torch.linalg.cholesky(covariance)
+        return log_density(residual, root, degrees if degrees.isfinite().all() else None).numpy()
 
     def _is_known(self, time: Floats) -> NDArray[np.bool_]:
         """Whether an output is known without noise at each of these times: there is no density there."""
@@ -295,9 +294,3 @@ def mixed(weight: Floats, moments: list[tuple[Floats, Floats]], outer: str) -> t
     whole = np.tensordot(weight, mean, 1)
     deviation = np.sqrt(weight)[:, np.newaxis, np.newaxis] * (mean - whole)
     return whole, np.tensordot(weight, covariance, 1) + np.einsum(outer, deviation, deviation)
-
-
-def check_regressor(regressor: Any) -> None:
-    """Check that a parameter is None or an estimator of mean and covariance."""
-    if regressor is not None and (isinstance(regressor, type) or not hasattr(regressor, "predict_df")):
-        raise checks.refusal(regressor, "regressor", "a covariance regressor or None")

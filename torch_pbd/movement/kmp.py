@@ -16,9 +16,9 @@ from torch_pbd.estimators.door import Standardization
 from torch_pbd.estimators.mixture import GMMBaseline
 from torch_pbd.estimators.validation import fit_with_groups
 from torch_pbd.files.memory import require_much
-from torch_pbd.movement.base import MovementRegressor, check_regressor
+from torch_pbd.movement.base import MovementRegressor
 from torch_pbd.movement.joint import Conditioned, JointNormal
-from torch_pbd.movement.law import as_rows, check_arrays, semidefinite_root
+from torch_pbd.movement.law import as_rows, check_arrays, check_regressor, semidefinite_root
 
 _ARRAYS = ("reference.time", "reference.mean", "reference.covariance", "range", "shift", "scale")  # in model files
 _LEAST = 1e-6  # least variance in the reference, of standardized outputs; the paper's of a point without noise
@@ -128,7 +128,10 @@ class KMPBaseline(MovementRegressor):
         return mean, np.outer(self._scale, self._scale) * own
 
     def _through_reference(self, time: Floats) -> tuple[Floats, Floats, float]:
-        """Mean (n, d), unitless ``V_t = L^-1 k_t'`` (n, N d, d), ``L L' = K + lambda_cov S``; ``N / lambda_cov``."""
+        """Mean (n, d), unitless ``V_t = L^-1 k_t'`` (n, N d, d), ``L L' = K + lambda_cov S``; ``N / lambda_cov``.
+
+        This N is of the fit: via points make nothing elsewhere more variable.
+        """
         reference, means, covariances = self._with_via_points()
         n_reference, d = means.shape
         gram, noise = np.kron(self._kernel(reference, reference), np.eye(d)), block_diag(*covariances)
@@ -137,7 +140,7 @@ class KMPBaseline(MovementRegressor):
         inverse = solve_triangular(root, np.eye(len(root)), lower=True).reshape(-1, n_reference, d)
         cross = self._kernel(time, reference)
         mean = self._shift + self._scale * (cross @ weights)
-        return mean, np.tensordot(cross, inverse, axes=(1, 1)), n_reference / self.lambda_cov
+        return mean, np.tensordot(cross, inverse, axes=(1, 1)), len(self._reference[0]) / self.lambda_cov
 
     def _kernel(self, time: Floats, other: Floats) -> Floats:
         difference = self._scaled(time)[:, np.newaxis] - self._scaled(other)

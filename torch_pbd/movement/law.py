@@ -272,3 +272,9 @@ def check_arrays(arrays: dict[str, Floats], shapes: dict[str, tuple[int | str, .
         raise ValueError(f"its arrays are {', '.join(arrays)}, must be {', '.join(shapes)}")
     for name, shape in shapes.items():
         checks.array(arrays[name], name, shape)
+
+
+def check_regressor(regressor: Any) -> None:
+    """Check that a parameter is None or an estimator of mean and covariance."""
+    if regressor is not None and (isinstance(regressor, type) or not hasattr(regressor, "predict_df")):
+        raise checks.refusal(regressor, "regressor", "a covariance regressor or None")

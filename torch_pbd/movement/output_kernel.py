@@ -16,10 +16,11 @@ from torch_pbd.movement.time_kernel import TimeKernel, smooth_correlation
 # Candidate length scales in ranges of the time, from the spacing of fifty steps to a movement that bends once, and
 # candidate nuggets shared by all steps.
 _LENGTHS = torch.logspace(math.log10(0.02), 0.0, 14, dtype=torch.float64).tolist()
-# Factors from the one before to the next of these, at their ends too: smooth laws are a third farther without.
+# Factors that refine a length scale, from the candidate before it to the next, beyond the ends too. Without them the
+# law of smooth movements is a third farther from the truth.
 _BETWEEN = [(_LENGTHS[1] / _LENGTHS[0]) ** (step / 6.0) for step in range(-6, 7)]
 _NUGGETS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1)
-# Candidate variances of the tremor over the slow part's at a usual step; of both these are 3, 10, 30 and 60 %.
+# Candidate variances of the tremor over the slow part's at a usual step: 3, 10, 30 and 60 % of that of both.
 _FINE = tuple(weight / (1.0 - weight) for weight in (0.03, 0.1, 0.3, 0.6))
 _RATIOS = (2.0, 4.0)  # candidate ratios of the slow length scale to the tremor's
 _LEAST, _MOST, _FIRST = 1e-6, 1e3, 1e-2  # nuggets: smallest, largest, and where expectation maximization starts
@@ -27,7 +28,7 @@ _N_STEPS, _TOLERANCE = 40, 0.02  # expectation maximization: most iterations, an
 _SMOOTH = 1e-3  # largest nugget of a step that is distinguished from noise: such steps determine the length scale
 _NEAR = 2.5  # factor around a length scale within which it is searched again once there are nuggets
 _USUAL = 2.0  # factor around the median within which the size of a step's residuals is usual
-_MOST_FIRST = 100  # steps of the first search: twice as many as the shortest length scale is spacings of
+_MOST_FIRST = 100  # most steps of the first search: two for each shortest length scale
 _ROUNDS = 3  # alternations of nuggets and length scale, which depend on each other
 
 # Length scales of the slow part and of the tremor, and the ratio of their variances at a usual step, 0 without one.
@@ -62,19 +63,15 @@ class OutputSeries:
     def start(self, kernel: str) -> Start:
         """Likeliest length scale of the usual steps, and the nugget of each step under it."""
         usual = self.usual_steps().nonzero()[:, 0]
-        some = torch.zeros_like(self.grid, dtype=torch.bool)
-        some[usual[:: math.ceil(len(usual) / _MOST_FIRST)]] = True
-        found = self.search(some, kernel)
-        unit = self._candidates([found.scales], kernel)[0]
-        nugget = self._step_nuggets(unit, _LEAST)
+        found = self.search(usual[:: math.ceil(len(usual) / _MOST_FIRST)], kernel)
+        nugget, unit = self._step_nuggets(found.scales, kernel, _LEAST), self._candidates([found.scales], kernel)[0]
         return Start(found, nugget, float(_log_likelihood((unit + torch.diag(nugget))[None], self.residual)))
 
     def fit(self, kernel: str, start: Start, is_sum: bool) -> TimeKernel:
         """Scales and nuggets in alternation."""
         single, nugget = start.found, start.nugget
         found = self._with_tremor(self.usual_steps(), kernel, single) if is_sum else single
-        unit = self._candidates([found.scales], kernel)[0]
-        nugget = self._step_nuggets(unit, _LEAST) if is_sum else nugget
+        nugget = self._step_nuggets(found.scales, kernel, _LEAST) if is_sum else nugget
         for _ in range(_ROUNDS):
             smooth = nugget <= _SMOOTH
             steps = smooth if 2 * smooth.sum() >= len(self.grid) else nugget <= nugget.median()
@@ -82,17 +79,15 @@ class OutputSeries:
             found = self._with_tremor(steps, kernel, single) if is_sum else single
             if found[1:] == before[1:]:
                 break
-            unit = self._candidates([found.scales], kernel)[0]
-            nugget = self._step_nuggets(unit, min(found.nugget, 0.1 * _SMOOTH))
+            nugget = self._step_nuggets(found.scales, kernel, min(found.nugget, 0.1 * _SMOOTH))
         return self._refined(kernel, found.scales, nugget)
 
     def refit(self, before: TimeKernel, number: int) -> TimeKernel:
         """Nuggets, and scales around those of one of the outputs before, whose tremor was of the same size."""
         ratio = float((before.fine[number] / self.tremor.square()).median())
-        slow, fast = before.scales[number].tolist()
-        unit = self._candidates([(slow, fast, ratio)], before.kernel)[0]
-        nugget = self._step_nuggets(unit, float(before.nugget[number].min()))
-        return self._refined(before.kernel, (slow, fast, ratio), nugget)
+        scales = (*before.scales[number].tolist(), ratio)
+        nugget = self._step_nuggets(scales, before.kernel, float(before.nugget[number].min()))
+        return self._refined(before.kernel, scales, nugget)
 
     def _refined(self, kernel: str, scales: Scales, nugget: Float[Tensor, " T"]) -> TimeKernel:
         """Time kernel of the likeliest scales around these, of all steps with the nugget of each."""
@@ -116,12 +111,12 @@ class OutputSeries:
         usual = (sizes > sizes.nanmedian() / _USUAL) & (sizes < sizes.nanmedian() * _USUAL)
         return usual if 2 * int(usual.sum()) >= len(usual) else torch.ones_like(usual)
 
-    def search(self, steps: Bool[Tensor, " T"], kernel: str, near: float | None = None) -> Found:
-        """Likeliest length scale at some steps, among all or among those near a previous one."""
+    def search(self, steps: Tensor, kernel: str, near: float | None = None) -> Found:
+        """Likeliest length scale at some steps, numbers or a mask, among all or among those near a previous one."""
         lengths = [length for length in _LENGTHS if near is None or near / _NEAR <= length <= near * _NEAR]
         return self._likeliest(steps, kernel, [(length, length, 0.0) for length in lengths], _NUGGETS)
 
-    def _with_tremor(self, steps: Bool[Tensor, " T"], kernel: str, single: Found) -> Found:
+    def _with_tremor(self, steps: Tensor, kernel: str, single: Found) -> Found:
         """Likeliest of one length scale and of two on either side of it, where a tremor replaces part of the nugget."""
         length = single.scales[0]
         choices = itertools.product(_RATIOS, _LENGTHS, _FINE)
@@ -129,9 +124,7 @@ class OutputSeries:
         nuggets = [nugget for nugget in _NUGGETS if nugget <= single.nugget]
         return self._likeliest(steps, kernel, [single.scales, *pairs], nuggets)
 
-    def _likeliest(
-        self, steps: Bool[Tensor, " T"], kernel: str, candidates: Sequence[Scales], nuggets: Sequence[float]
-    ) -> Found:
+    def _likeliest(self, steps: Tensor, kernel: str, candidates: Sequence[Scales], nuggets: Sequence[float]) -> Found:
         """Highest log likelihood of ``(1 - eta) K + eta I`` at some steps, with its scales and shared nugget eta."""
         rows, unit = unit_rms(self.residual[:, steps]), self._candidates(candidates, kernel, steps)
         eye = torch.eye(unit.shape[1]).to(unit)
@@ -151,12 +144,13 @@ class OutputSeries:
         (lengths, fine), time = self._parts(scales), self.grid[steps]
         return smooth_correlation(time, time, lengths, fine[:, steps], fine[:, steps], kernel)
 
-    def _step_nuggets(self, unit: Float[Tensor, "T T"], least: float) -> Float[Tensor, " T"]:
+    def _step_nuggets(self, scales: Scales, kernel: str, least: float) -> Float[Tensor, " T"]:
         """Nugget of each step, by expectation maximization over the independent parts of the residuals.
 
         With ``S = K + diag e`` and ``a = S^-1 z`` an independent part has the mean ``e_t a_t`` and the variance
         ``e_t - e_t^2 [S^-1]_tt``; their second moment is the next e_t.
         """
+        unit = self._candidates([scales], kernel)[0]
         groups = [(unit[seen][:, seen], seen, rows) for seen, rows in _by_pattern(self.residual)]
         nugget = torch.full_like(self.grid, max(least, _FIRST))
         for _ in range(_N_STEPS):

@@ -10,8 +10,8 @@ from torch import Tensor
 from torch_pbd.movement.output_kernel import OutputSeries, Start, unit_rms
 from torch_pbd.movement.time_kernel import LeftOut, TimeKernel, left_out
 
-# Nats a demonstration. Kernels that a step of noise had decided on lost 14 to 99, of recordings others gained up to 9
-# and left-out demonstrations nothing.
+# Nats a demonstration by which another kernel must be likelier. Where a step of noise had decided the choice lost 14 to
+# 99; by differences of up to 9 left-out demonstrations gained nothing.
 _CLEARLY = 10.0
 # Outputs are sorted in steps of this factor of their squared second differences, counted from the smoothest one's, or
 # from the least that counts.
@@ -20,7 +20,7 @@ FEWEST_DF = 3.0
 """Least degrees of freedom of a movement, whose variance must exist."""
 
 _STILL = 1e-3  # rms of residuals, over their predicted deviation, of an output that does not vary
-_N_DF = 40  # candidates between the most and the fewest
+_N_DF = 40  # candidate degrees of freedom
 _EVEN = 30.0  # degrees of freedom from which sizes differ too little, by 13 %, to weigh demonstrations by them
 _SHARES = (1.0, 0.9, 0.75, 0.6, 0.45, 0.3, 0.2, 0.1, 0.05)  # candidate weights of the kernel in the correlation
 
@@ -38,7 +38,7 @@ def fit_time_kernel(
     Each output's residuals, given those that are smoother, were divided by its ``deviation``. The likeliest of the
     ``kernels`` is taken, another where demonstrations left out in turn are clearly likelier, and for ``share`` None the
     share under which they are likeliest. The second is their squared distance each under the law of the others.
-    Scales are near those of the one ``before`` of nearly the same residuals, as is its kernel, which saves the search.
+    The kind of one ``before``, of nearly the same residuals, is kept and its scales are refined, which saves the search.
     """
     parts, tremor = map(unit_rms, residual.unbind(2)), deviation.median(0).values / deviation
     outputs = [OutputSeries(grid, *part) for part in zip(parts, tremor.mT, strict=True)]
@@ -84,8 +84,8 @@ def fit_weighted(
 def movement_df(square: Float[Tensor, " K"], size: Int64[Tensor, " K"], most: float) -> float:
     """Degrees of freedom, at most ``most``, under which left-out demonstrations of this square and size are likeliest.
 
-    The covariance is the same under all. The few whose marginals were learned from them too differ less in size than a
-    new one does, so that this can tell of fewer degrees of freedom than others do, not of more.
+    The covariance is the same under all. Demonstrations whose marginals were learned from them too differ less in size
+    than a new one does: these may say fewer degrees of freedom than ``most``, never more.
     """
     df = most * (FEWEST_DF / most) ** torch.linspace(0.0, 1.0, _N_DF, dtype=torch.float64)[:, None]
     value = torch.lgamma(0.5 * (df + size)) - torch.lgamma(0.5 * df) - 0.5 * size * (df - 2.0).log()

@@ -136,8 +136,9 @@ class Timing:
         """Midpoints of a lattice's cells, and center and root of the next lattice with the power that placed it.
 
         Durations depend on the first axis alone, as ``root`` is a lower factor; it is cut where movements would have
-        ended. Where too few nodes carry the weight, a power of the likelihood places the next lattice. It is above
-        ``least``, that of the last one: a posterior that leans against the cut, with a long tail, would stay there.
+        ended. Where too few nodes carry the weight, the likelihood is flattened by a power below one to place the next
+        lattice. The power grows from lattice to lattice, above ``least``: a posterior that leans against the cut, with a
+        long tail, would never be narrowed down.
         """
         low = min(max(float((cut - center[0]) / root[0, 0]), -_REACH), 0.9 * _REACH)
         axes, cell = [], root.new_ones(2)

@@ -19,9 +19,8 @@ from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
 from torch_pbd.estimators.validation import fit_with_groups
 from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import safe_cholesky
-from torch_pbd.movement.base import check_regressor
 from torch_pbd.movement.joint import JointNormal
-from torch_pbd.movement.law import as_rows, check_arrays
+from torch_pbd.movement.law import as_rows, check_arrays, check_regressor
 from torch_pbd.movement.time_kernel import TimeKernel
 from torch_pbd.movement.time_kernel_fit import FEWEST_DF, fit_weighted, smoothest_first
 from torch_pbd.movement.timed import TimedMovement, n_grid_steps, sampled
