@@ -291,7 +291,7 @@ def test_what_timing_cannot_do_is_refused(shown, model):
         ValueError, match=r"X reaches 50, must be at most .*: no movement like those shown lasts longer"
     ):
         model.condition([[50.0]], [[0.0, 0.0]])
-    with pytest.raises(ValueError, match="X has a time of -0.5, must be at least 0: count from the movement's start"):
+    with pytest.raises(ValueError, match=r"X has a time of -0\.5, must be at least 0: count from the movement's start"):
         model.predict([[-0.5]])
     with pytest.raises(ValueError, match="timing of covariance is 'warp', must be 'none'"):
         DMPController(TrajectoryRegressor(timing="warp")).fit(shown)

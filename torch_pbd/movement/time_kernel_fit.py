@@ -38,7 +38,7 @@ def fit_time_kernel(
     Each output's residuals, given those that are smoother, were divided by its ``deviation``. The likeliest of the
     ``kernels`` is taken, another where demonstrations left out in turn are clearly likelier, and for ``share`` None the
     share under which they are likeliest. The second is their squared distance each under the law of the others.
-    The kind of one ``before``, of nearly the same residuals, is kept and its scales are refined, which saves the search.
+    The kind of one ``before``, of nearly the same residuals, is kept and its scales are refined: the search is saved.
     """
     parts, tremor = map(unit_rms, residual.unbind(2)), deviation.median(0).values / deviation
     outputs = [OutputSeries(grid, *part) for part in zip(parts, tremor.mT, strict=True)]

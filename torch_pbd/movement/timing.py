@@ -137,8 +137,8 @@ class Timing:
 
         Durations depend on the first axis alone, as ``root`` is a lower factor; it is cut where movements would have
         ended. Where too few nodes carry the weight, the likelihood is flattened by a power below one to place the next
-        lattice. The power grows from lattice to lattice, above ``least``: a posterior that leans against the cut, with a
-        long tail, would never be narrowed down.
+        lattice. The power grows from lattice to lattice, above ``least``: a posterior that leans against the cut, with
+        a long tail, would never be narrowed down.
         """
         low = min(max(float((cut - center[0]) / root[0, 0]), -_REACH), 0.9 * _REACH)
         axes, cell = [], root.new_ones(2)
