@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 from torch_pbd import (
+    CholeskyCovRegressor,
     Demonstrations,
     DMPController,
     GMMBaseline,
+    KMPBaseline,
     ProMPBaseline,
     TrajectoryRegressor,
     load_demonstrations,
@@ -294,6 +296,40 @@ def test_a_movement_that_was_pushed_goes_on_from_where_it_is(controller):
     twice = again.condition([1.5], [again.predict([[1.5]])[0] + [0.005, 0.0]], noise_scale=1e-3)
     assert 0.002 < twice.predict([[1.5]])[0, 0] - again.predict([[1.5]])[0, 0] < 0.0051
     np.testing.assert_array_equal(controller.predict([[1.2]]), before[:1])
+
+
+def test_noise_of_recordings_is_no_kink_of_a_plan():
+    """A step's own noise was once passed at each observed time: accelerations of 39 m/s^2, where 0.25 were shown."""
+    rng, s = np.random.default_rng(0), TIME / 2.0
+    rise, bow = s**3 * (10.0 - 15.0 * s + 6.0 * s**2), np.sin(np.pi * s) ** 2
+    ways = [
+        np.stack([0.5 * rise + 0.02 * a * bow, (0.15 + 0.03 * b) * bow], axis=1) for a, b in rng.normal(size=(8, 2))
+    ]
+    shown = Demonstrations(TIME, np.stack(ways) + 5e-4 * rng.normal(size=(8, 101, 2)), units="m")
+    plain = running = DMPController(TrajectoryRegressor(CholeskyCovRegressor())).fit(shown)
+
+    def roughest(controller, **options):
+        plan = controller.schedule(rate=500.0, **options)
+        return np.abs(plan.acceleration).max(), np.abs(plan.velocity[-1]).max()
+
+    shake, last = roughest(plain)
+    for time in np.arange(0.5, 1.0, 0.02):
+        where = running.predict([[time]]) + 5e-4 * rng.normal(size=(1, 2))
+        running = running.condition([time], where, noise_scale=5e-4)
+    assert roughest(running)[0] < 2.5 * shake
+    np.testing.assert_allclose(running.predict([[time]]), where, atol=2e-3)
+    aside = np.array([0.02, 0.0])
+    for options in ({"goal": plain.goal_ + aside}, {"via": [(1.0, plain.predict([[1.0]])[0] + aside)]}):
+        bent, at_end = roughest(plain, **options)
+        assert bent < 3.0 * shake
+        assert at_end < last + 0.01
+
+
+def test_a_via_point_is_met_by_a_model_that_passes_it_nearly(controller):
+    kmp = DMPController(KMPBaseline()).fit(demonstrations())
+    where = kmp.predict([[1.0]])[0] + [0.0, 0.03]
+    passed = kmp.condition([1.0], [where])
+    np.testing.assert_allclose(passed.predict([[1.0]])[0], where, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["letter_G", pytest.param("kuka_cshape_top", marks=pytest.mark.slow)])

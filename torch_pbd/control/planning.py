@@ -104,8 +104,9 @@ class Planning(BaseEstimator):
     def condition(self, times: ArrayLike, positions: ArrayLike, *, noise_scale: ArrayLike = 0.0) -> Self:
         """Fitted copy, conditioned on passing positions: a via point, the part observed so far, or a push.
 
-        The rest of the movement and its gains follow from the demonstrations' correlation. ``covariance`` must be a
-        model of whole movements, with variability="position". A copy can be conditioned again.
+        All of the movement and its gains follow by the demonstrations' correlation, what lies before too, smoothly:
+        positions with noise are passed as near as is likely. ``covariance`` must be a model of whole movements, with
+        variability="position". A copy can be conditioned again.
 
         Parameters
         ----------
@@ -169,7 +170,8 @@ class Planning(BaseEstimator):
             within a tenth to a half of the duration, where no data are near, on_unknown="soft" makes the robot
             compliant. With phase_input="s" models that extrapolate flatly in s keep it stiff.
         goal, start : array-like of shape (d,), default=None
-            Goal and start in the units of the recordings; None are ``goal_`` and ``start_``. A moving goal is (n, d),
+            Goal and start in the units of the recordings; None are ``goal_`` and ``start_``, or after :meth:`condition`
+            the ends of the bent movement: give ``goal_`` where the goal must not move with it. A moving goal is (n, d),
             one row each, without ``via``. Poses, here and in ``via``, are p positions and a unit quaternion w x y z, or
             p + 3 outputs.
         via : sequence of (time, position), default=None

@@ -21,6 +21,7 @@ from torch_pbd.checks import Floats
 from torch_pbd.exceptions import InvalidParameterError
 
 _N_KNOTS = 200  # knots of a change over a movement, whose length scales are at least a fiftieth of it
+_BESIDE = 1e-3  # share of their distance by which these are beside an observed time
 # Standard deviations beyond which nobody deviates: steps of left-out demonstrations were up to 23 away.
 _FAR = 30.0
 _AGREE = 1e-4  # share of the movement's extent by which points at one time may differ: 30 um of 0.3 m
@@ -57,22 +58,42 @@ def conditioned(
     # Observations are in outputs, any of which may be free, while poses are learned along other axes.
     model = controller.covariance_.observed_along(outputs.axes)
     shown, inputs, stays = getattr(controller, "_shown", model), phase(time), phase(np.array(pins))
-    bent = model.condition(inputs, outputs.decode(model.predict(inputs)) + change, noise_scale=noise_scale)
+    bent = model.condition(inputs, _in_model(controller, time) + change, noise_scale=noise_scale)
     if len(time):
         _warn_of_far(controller, time, change, outputs.covariance(shown.predict_cov(inputs)), noise_scale)
+    # Pins are where the model has them: the path, smooth, may be off by what is many of its deviations at an end.
     moved = bent.condition(stays, outputs.decode(model.predict(stays))) if len(pins) else bent
-    # Knots are even, except next to observed times, of now and before, where the change must be exact.
-    own = np.append(controller.reproduction_.time_of(bent._known.time), pins).clip(0.0, controller.duration_)
-    even = np.linspace(0.0, controller.duration_, _N_KNOTS)
-    far = np.abs(even[:, np.newaxis] - own).min(axis=1, initial=np.inf) > 0.25 * even[1]
-    knots = np.unique(np.append(even[far], own))
-    knots = knots[np.diff(knots, prepend=-np.inf) > _rounding(controller)]
     result = copy.copy(controller)
     result.covariance_, result._shown = bent, shown
     result.reproduction_ = copy.copy(controller.reproduction_)
-    changes = outputs.decode(moved.predict(phase(knots)) - shown.predict(phase(knots)))
+    # At observed times the models predict a step's independent part too, trembling or noise, of which a plan would be a
+    # kink: the change is smooth, of times between, and what is then left at exact points goes from rest to rest.
+    even, known = np.linspace(0.0, controller.duration_, _N_KNOTS), controller.reproduction_.time_of(bent._known.time)
+    beside = np.abs(even[:, np.newaxis] - np.append(known, pins)).min(axis=1, initial=np.inf) < _BESIDE * even[1]
+    between = even + np.where(even > 0.5 * even[-1], -_BESIDE, _BESIDE) * even[1] * beside
+    smooth = CubicSpline(between, outputs.decode(moved.predict(phase(between)) - shown.predict(phase(between))))
+    exact = bent._known.exact.any(axis=1) & (np.abs(known - 0.5 * even[-1]) <= 0.5 * even[-1] + _rounding(controller))
+    at = np.append(known[exact], pins).clip(0.0, even[-1])
+    inputs = np.concatenate([bent._known.time[exact, np.newaxis], stays])
+    aims = np.where(bent._known.exact, bent._known.value, np.nan)[exact].reshape(-1, controller.n_outputs_)
+    left = (
+        np.concatenate([aims, _in_model(controller, np.array(pins))])
+        - outputs.decode(shown.predict(inputs))
+        - smooth(at)
+    )
+    far = np.abs(even[:, np.newaxis] - at).min(axis=1, initial=np.inf) > 0.25 * even[1]
+    knots = np.unique(np.append(even[far], at))
+    knots = knots[np.diff(knots, prepend=-np.inf) > _rounding(controller)]
+    changes = smooth(knots) + _rest_to_rest(result, list(zip(at.tolist(), left, strict=True)), knots)
     result.reproduction_.bend = CubicSpline(knots, changes)
     return result
+
+
+def _in_model(controller: Any, time: Floats) -> Floats:
+    """Places (n, d) of the path at movement times (n,), but for the error of its reproduction of the model's mean."""
+    shown, reproduction = getattr(controller, "_shown", controller.covariance_), controller.reproduction_
+    mean = controller.outputs_.decode(shown.predict(reproduction.phase(time)))
+    return mean if reproduction.bend is None else mean + reproduction.bend(time.clip(0.0, controller.duration_))
 
 
 def _warn_of_far(controller: Any, time: Floats, change: Floats, covariance: Floats, noise_scale: ArrayLike) -> None:
@@ -149,15 +170,18 @@ class _Likely:
     def __init__(self, controller: Any, pins: Sequence[float]) -> None:
         self.times, self.changes = list[float](), list[Floats]()
         self._controller, self._outputs = controller, controller.outputs_
-        self._model = self._before = controller.covariance_.observed_along(self._outputs.axes)
+        self._model = controller.covariance_.observed_along(self._outputs.axes)
         if pins:
             stays = controller.reproduction_.phase(np.array(pins))
-            self._model = self._before.condition(stays, self._outputs.decode(self._before.predict(stays)))
+            self._model = self._model.condition(stays, self._outputs.decode(self._model.predict(stays)))
 
     def add(self, at: float, change: Floats, name: str = "") -> Floats:
         """What of a change, NaN where free, is beyond 95 % of demonstrations; if a named point's is, it warns."""
         inputs, given = self._controller.reproduction_.phase(np.array([at])), ~np.isnan(change)
-        before, now = (self._outputs.decode(model.predict(inputs))[0] for model in (self._before, self._model))
+        before, now = (
+            _in_model(self._controller, np.array([at]))[0],
+            self._outputs.decode(self._model.predict(inputs))[0],
+        )
         left, size = change - (now - before), int(given.sum())
         covariance = self._outputs.covariance(self._model.predict_cov(inputs))[0][np.ix_(given, given)]
         degrees = min(float(self._model.predict_df(inputs)[0]), 1e12)  # infinite ones are not for f
@@ -187,7 +211,7 @@ def _rest_to_rest(controller: Any, beyond: list[tuple[float, Floats]], time: Flo
     for output in range(controller.n_outputs_):
         own = {at: change[output] for at, change in beyond if not np.isnan(change[output])}
         # A via point takes the place of an end, and of what was known with noise.
-        kept = (np.abs(still[:, np.newaxis] - [*own]) > _rounding(controller)).all(axis=1)
+        kept = (np.abs(still[:, np.newaxis] - [*own]) > _BESIDE * duration / _N_KNOTS).all(axis=1)
         kept[:-2] &= is_known[:, output]
         own |= dict.fromkeys(still[kept].tolist(), 0.0)
         points = sorted(own.items())

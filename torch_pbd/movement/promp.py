@@ -32,7 +32,8 @@ class ProMPBaseline(MovementRegressor):
 
     Bases are normalized Gaussians over the time; a ridge regression finds the weights of each demonstration, near those
     of all together. Their covariance is singular for fewer demonstrations than weights: it is shrunk towards a smooth
-    one, a squared exponential over the bases' numbers times the covariance of the outputs.
+    one, a squared exponential over the bases' numbers times the covariance of the outputs. That has one size for all
+    times: where demonstrations narrow to a tenth, the deviation may be many times theirs.
 
     Parameters
     ----------
