@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 import torch
 from scipy.linalg import block_diag
-from scipy.stats import multivariate_normal, multivariate_t
+from scipy.stats import chi2, multivariate_normal, multivariate_t
 from sklearn.base import clone
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import MinMaxScaler
@@ -378,6 +378,24 @@ def test_outputs_that_do_not_vary_say_nothing_of_sizes():
         found.append(TrajectoryRegressor(CholeskyCovRegressor()).fit(X, y, groups=groups).df_)
     assert found[1] == pytest.approx(found[0], rel=0.2)
     assert found[2] == 200.0  # one movement, shown again and again
+
+
+def test_demonstrations_count_by_the_inverse_square_that_their_size_is_expected_to_have():
+    series = sample_series("matern52", 0.3, 12)
+    series[::4] *= 4.0
+    series[0, 5:17] = series[1, 20:25] = torch.nan
+    grid, deviation = torch.from_numpy(GRID), torch.ones_like(series[0])
+    found, _ = time_kernel_fit.fit_weighted(grid, series, deviation, ["matern52"], None, 20.0, is_even=False)
+    square, size = fitted_kernel(series, "matern52")[1], (~series.isnan()).sum((1, 2))
+    df, expected = time_kernel_fit.movement_df(square, size, 20.0), []
+    # Brute force over the chi-squared variable of Student's t, by which a normal movement is multiplied.
+    chi = np.linspace(0.0, 300.0, 30_001)[1:]
+    inverse = chi / (df - 2.0)
+    for own, n in zip(square.numpy(), size.numpy(), strict=True):
+        posterior = chi2(df).logpdf(chi) + 0.5 * (n * np.log(inverse) - own * inverse)
+        expected.append(np.average(inverse, weights=np.exp(posterior - posterior.max())))
+    weight = (found.residual / series).square().nanmean(1).numpy()  # up to a factor for each output
+    np.testing.assert_allclose(weight / weight[-1], np.outer(expected, [1.0, 1.0]) / expected[-1], rtol=1e-6)
 
 
 def test_fewest_degrees_of_freedom_are_those_that_a_file_may_have():
