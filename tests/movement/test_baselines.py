@@ -10,14 +10,16 @@ from movement_primitives.promp import ProMP
 from scipy.stats import multivariate_normal, multivariate_t
 from sklearn.base import clone
 from sklearn.exceptions import NotFittedError
+from sklearn.gaussian_process.kernels import RBF
 from sklearn.model_selection import GroupKFold, cross_val_score
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import MinMaxScaler
 
 from movement.test_trajectory import GRID, gaussian_conditional, movements, stacked
 from torch_pbd import Demonstrations, KMPBaseline, ProMPBaseline, TrajectoryRegressor, load_demonstrations
+from torch_pbd.data.demonstrations import Demonstration
 from torch_pbd.exceptions import DataRankWarning
-from torch_pbd.movement.promp import basis_functions
+from torch_pbd.movement.promp import _Weights, basis_functions
 
 X = GRID[:, np.newaxis]
 
@@ -40,9 +42,13 @@ def published(promp):
     return ProMP(d, n_basis).from_weight_distribution(mean, covariance.reshape(d * n_basis, -1))
 
 
+def published_weights():
+    """Weights (30, 10, 2) of each of the movements."""
+    return np.stack([ProMP(2, 10).weights(GRID, demo).reshape(2, 10).T for demo in movements(30)])
+
+
 def test_promp_is_the_published_one(promp):
-    demos, reference = movements(30), ProMP(2, 10)
-    weights = [reference.weights(GRID, demo).reshape(2, 10).T for demo in demos]
+    weights = published_weights()
     np.testing.assert_allclose(promp.weight_mean_, np.mean(weights, axis=0), atol=1e-6)
     flat = np.reshape(weights, (30, -1))
     np.testing.assert_allclose(promp.weight_covariance_, np.cov(flat.T), atol=1e-6)
@@ -53,6 +59,26 @@ def test_promp_is_the_published_one(promp):
     own = covariance.reshape(noise.shape) - noise
     expected = other.cov_trajectory(GRID).reshape(2, len(GRID), 2, len(GRID)).transpose(1, 0, 3, 2)
     np.testing.assert_allclose(own, expected.reshape(noise.shape), atol=1e-6)
+
+
+def test_promp_is_shrunk_towards_the_covariance_of_the_outputs_over_all_bases():
+    model = fit(ProMPBaseline(n_basis=10, overlap=0.7, ridge=0.0, shrinkage=1.0), movements(30))
+    outputs = np.mean([np.cov(values.T) for values in published_weights().transpose(1, 0, 2)], axis=0)
+    smooth = RBF(model.reach_)(np.arange(10.0)[:, np.newaxis])
+    np.testing.assert_allclose(model.weight_covariance_, np.kron(smooth, outputs), atol=1e-6)
+
+
+def test_promp_judges_demonstrations_by_the_law_of_the_others():
+    demos = movements(5)
+    weights = _Weights([Demonstration(GRID, demo) for demo in demos], 8, 0.7, 1e-6)
+    bases, noise = np.kron(basis_functions(GRID, 8, 0.7), np.eye(2)), np.tile(weights.noise_scale**2, 30)
+    expected = 0.0
+    for own, demo in enumerate(demos):
+        others = np.delete(weights.values, own, axis=0)
+        covariance = bases @ weights.covariance(others, 2.0, 0.3) @ bases.T + np.diag(noise)
+        mean = bases @ others.reshape(4, -1).mean(axis=0)
+        expected += multivariate_normal(mean, covariance).logpdf(demo.ravel())
+    assert weights.left_out(2.0, 0.3) == pytest.approx(expected, rel=1e-6)
 
 
 def test_promp_is_conditioned_as_the_published_one(promp):
