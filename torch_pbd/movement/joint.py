@@ -11,6 +11,9 @@ from torch import Tensor
 
 from torch_pbd.linalg import safe_cholesky, spectral_map, symmetrize
 
+Along = Callable[[Tensor, Tensor], Tensor]
+"""Correlation R between times (n,) and others (m,), (c, n, m); of each with itself the same."""
+
 
 @dataclass(frozen=True)
 class JointNormal:
@@ -20,34 +23,38 @@ class JointNormal:
     independent of the others, and c is standard normal. The covariance is ``A (R - W W' + U U') A' - V V'``, with A
     block diagonal in the steps, and R, positive semidefinite, and W in the outputs, of which one may stand for all; W
     is the reduction by observations of whole steps, V that by single entries. Costs grow with d n^3 + n d (k + p)^2;
-    the marginals of single steps, given others, cost n alone.
+    the marginals of single steps, given others, cost n alone: of R they need the columns of what is given.
     """
 
     mean: Float[Tensor, "n d"]
     factor: Float[Tensor, "n d d"]  # A
-    prior_correlation: Float[Tensor, "c s s"]  # R, or of the first s steps alone, where there is a border
+    time: Float[Tensor, " n"]
+    along: Along
     loadings: Float[Tensor, "n d k"]  # U
     taken: Float[Tensor, "c n m"]  # W
     explained: Float[Tensor, "n d p"]  # V
-    border: Float[Tensor, "c n b"] | None = None  # the columns of R of the others, the last b steps
 
     @classmethod
-    def prior(cls, mean: Tensor, factor: Tensor, correlation: Tensor, loadings: Tensor) -> "JointNormal":
+    def prior(cls, mean: Tensor, factor: Tensor, time: Tensor, along: Along, loadings: Tensor) -> "JointNormal":
         """Law before anything is observed."""
-        return cls(mean, factor, correlation, loadings, correlation[..., :0], loadings[..., :0])
+        return cls(mean, factor, time, along, loadings, mean.new_zeros(1, len(mean), 0), loadings[..., :0])
 
     @classmethod
     def with_noise(
-        cls, mean: Float[Tensor, "n d"], loadings: Float[Tensor, "n d k"], scale: Float[Tensor, " d"]
+        cls,
+        time: Float[Tensor, " n"],
+        mean: Float[Tensor, "n d"],
+        loadings: Float[Tensor, "n d k"],
+        scale: Float[Tensor, " d"],
     ) -> "JointNormal":
         """Law of ``mean_t + loadings_t c`` plus noise of this scale, independent in all steps and outputs."""
-        n, d = mean.shape
-        return cls.prior(mean, scale.diag().expand(n, d, d), torch.eye(n).to(mean)[None], loadings / scale[:, None])
+        factor = scale.diag().expand(*mean.shape, len(scale))
+        return cls.prior(mean, factor, time, _independent, loadings / scale[:, None])
 
     @cached_property
     def _correlation(self) -> Float[Tensor, "c n n"]:
         """Correlation R - W W' given the observations of whole steps."""
-        return symmetrize(self.columns(torch.arange(len(self.mean))) - self.taken @ self.taken.mT)
+        return symmetrize(self.along(self.time, self.time) - self.taken @ self.taken.mT)
 
     @cached_property
     def correlation_root(self) -> Float[Tensor, "c n n"]:
@@ -56,29 +63,18 @@ class JointNormal:
 
     def at(self, steps: Int[Tensor, " m"]) -> "JointNormal":
         """Law of the selected steps."""
-        rows = {name: getattr(self, name)[steps] for name in ("mean", "factor", "loadings", "explained")}
-        return JointNormal(prior_correlation=self.columns(steps)[:, steps], taken=self.taken[:, steps], **rows)
+        rows = {name: getattr(self, name)[steps] for name in ("mean", "factor", "time", "loadings", "explained")}
+        return JointNormal(along=self.along, taken=self.taken[:, steps], **rows)
 
     def columns(self, steps: Int[Tensor, " m"]) -> Float[Tensor, "c n m"]:
         """Columns of R at these steps."""
-        if self.border is None:
-            return self.prior_correlation[:, :, steps]
-        size = self.prior_correlation.shape[1]
-        is_last, columns = steps >= size, self.border.new_empty(*self.border.shape[:2], len(steps))
-        others = steps[~is_last]
-        columns[:, :, is_last] = self.border[:, :, steps[is_last] - size]
-        columns[:, :, ~is_last] = torch.cat([self.prior_correlation[:, :, others], self.border[:, others].mT], dim=1)
-        return columns
+        return self.along(self.time, self.time[steps])
 
-    def joined(self, other: "JointNormal", between: Float[Tensor, "c n b"]) -> "JointNormal":
-        """Law of the steps of two unobserved laws with the correlation ``between`` them.
-
-        The first one's correlation is not copied: of a thousand steps of fourteen outputs it takes 112 MB.
-        """
-        pairs = ((self.mean, other.mean), (self.factor, other.factor), (self.loadings, other.loadings))
-        mean, factor, loadings = map(torch.cat, pairs)
-        border, correlation = torch.cat([between, other.prior_correlation], dim=1), self.prior_correlation
-        return JointNormal(mean, factor, correlation, loadings, border[..., :0], loadings[..., :0], border)
+    def joined(self, other: "JointNormal") -> "JointNormal":
+        """Law of the steps of two unobserved laws, whose correlation is the same."""
+        names = ("mean", "factor", "time", "loadings")
+        mean, factor, time, loadings = (torch.cat([getattr(law, name) for law in (self, other)]) for name in names)
+        return JointNormal.prior(mean, factor, time, self.along, loadings)
 
     def covariance(self) -> Float[Tensor, "n d n d"]:
         """Covariance of all outputs at all steps."""
@@ -93,10 +89,7 @@ class JointNormal:
 
     def marginal(self) -> Float[Tensor, "n d d"]:
         """Covariance of the outputs at each step."""
-        variance = self.prior_correlation.diagonal(dim1=1, dim2=2)
-        if self.border is not None:
-            variance = torch.cat([variance, self.border[:, variance.shape[1] :].diagonal(dim1=1, dim2=2)], dim=1)
-        variance = variance - self.taken.square().sum(2)
+        variance = self.along(self.time[:1], self.time[:1])[..., 0] - self.taken.square().sum(2)
         inner = self.loadings @ self.loadings.mT
         inner.diagonal(dim1=1, dim2=2).add_(variance.mT)
         whole = symmetrize(self.factor @ inner @ self.factor.mT - self.explained @ self.explained.mT)
@@ -220,6 +213,10 @@ class Conditioned:
             return x
         errors = entries - (self._directions * x[:, self._entry_steps]).sum(-1)
         return x + torch.einsum("ndp,ps->snd", self._columns, torch.cholesky_solve(errors.mT, self._entry_root))
+
+
+def _independent(time: Float[Tensor, " n"], other: Float[Tensor, " m"]) -> Float[Tensor, "1 n m"]:
+    return (time[:, None] == other).to(time)[None]
 
 
 def _over_root(rows: Float[Tensor, "n d p"], root: Float[Tensor, "p p"]) -> Float[Tensor, "n d p"]:

@@ -118,7 +118,7 @@ class KMPBaseline(MovementRegressor):
         gram = np.kron(self._kernel(time, time), np.eye(d))
         root = semidefinite_root(level * (gram - explained @ explained.T)).reshape(n, d, n * d)
         root *= self._scale[:, np.newaxis]
-        return JointNormal.with_noise(*map(torch.from_numpy, (mean, root, np.sqrt(self.nugget) * self._scale)))
+        return JointNormal.with_noise(*map(torch.from_numpy, (time, mean, root, np.sqrt(self.nugget) * self._scale)))
 
     def _rows(self, time: Floats) -> tuple[Floats, Floats]:
         # Each row alone: the covariance between rows would cost the cube of their number to factorize.

@@ -69,10 +69,6 @@ class MovementLaw(BaseEstimator, ABC):
     def _prior(self, time: Floats) -> JointNormal:
         """Joint law at times (n,), all different, before anything is known of the movement."""
 
-    def _between(self, time: Floats, other: Floats) -> Tensor:
-        """Correlation between different times, as in :class:`JointNormal`, to which noise adds nothing."""
-        return torch.zeros(1, len(time), len(other), dtype=torch.float64)
-
     @abstractmethod
     def _arrays(self) -> dict[str, Floats]:
         """Arrays of the law for model files, without the regressor's."""
@@ -192,7 +188,7 @@ class MovementLaw(BaseEstimator, ABC):
         index[old] = place
         new = time[index < 0]
         if len(new):
-            law = law.joined(self._prior(new), self._between(last, new))
+            law = law.joined(self._prior(new))
             index[index < 0] = len(last) + np.arange(len(new))
         return law, index
 

@@ -130,7 +130,8 @@ class ProMPBaseline(MovementRegressor):
         scale = np.tile(self.noise_scale_, self.n_basis_)
         root = semidefinite_root(self.weight_covariance_ / np.outer(scale, scale)) * scale[:, np.newaxis]
         loadings = np.einsum("nb,bdk->ndk", bases, root.reshape(self.n_basis_, self.n_outputs_, -1))
-        return JointNormal.with_noise(*map(torch.from_numpy, (bases @ self.weight_mean_, loadings, self.noise_scale_)))
+        mean = bases @ self.weight_mean_
+        return JointNormal.with_noise(*map(torch.from_numpy, (time, mean, loadings, self.noise_scale_)))
 
 
 class _Weights:

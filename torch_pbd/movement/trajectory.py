@@ -65,23 +65,29 @@ class TrajectoryLaw(nn.Module):
         self, x: Float[Tensor, " n"], mean: Float[Tensor, "n d"], covariance: Float[Tensor, "n d d"]
     ) -> JointNormal:
         """Joint law at times that are all different, of these marginals."""
-        return JointNormal.prior(mean, *self._parts(x, covariance))
+        time = (x - self.x_shift) / self.x_scale
+        factor, loadings = self._parts(time, covariance)
+        return JointNormal.prior(mean, factor, time, self._along, loadings)
 
-    def _parts(self, x: Float[Tensor, "*b n"], covariance: Float[Tensor, "m d d"]) -> tuple[Tensor, Tensor, Tensor]:
-        """A (m, d, d), correlations (d, *b, n, n) and loadings (m, d, k) of movements at m times in all."""
-        kernel, time = self.time_kernel, (x - self.x_shift) / self.x_scale
-        loadings = ((1.0 - kernel.share) / len(kernel.residual)).sqrt() * kernel.loadings(time.flatten())
+    def _along(self, time: Float[Tensor, "*b n"], other: Float[Tensor, "*b m"]) -> Float[Tensor, "d *b n m"]:
+        return self.time_kernel.share * self.time_kernel.correlation(time, other)
+
+    def _parts(self, time: Float[Tensor, " m"], covariance: Float[Tensor, "m d d"]) -> tuple[Tensor, Tensor]:
+        """A (m, d, d) and loadings (m, d, k) of movements at m times in all, in ranges of those of the fit."""
+        kernel = self.time_kernel
+        loadings = ((1.0 - kernel.share) / len(kernel.residual)).sqrt() * kernel.loadings(time)
         # A_t divides by the factor of S_tt, so that the blocks of the joint law are those of the marginals.
         own = loadings @ loadings.mT + kernel.share * torch.eye(len(self.order)).to(loadings)
         root = root_in_order(covariance, self.order)
         factor = torch.linalg.solve_triangular(torch.linalg.cholesky(own), root, upper=False, left=False)
-        return factor, kernel.share * kernel.correlation(time, time), loadings
+        return factor, loadings
 
     def covariances(self, x: Float[Tensor, "b n"], covariance: Float[Tensor, "m d d"]) -> Float[Tensor, "b n*d n*d"]:
         """Covariances of several movements, each at few times of its own."""
-        factor, correlation, loadings = self._parts(x, covariance)
+        time = (x - self.x_shift) / self.x_scale
+        factor, loadings = self._parts(time.flatten(), covariance)
         factor, common = factor.unflatten(0, x.shape), (factor @ loadings).unflatten(0, x.shape).flatten(1, 2)
-        along = torch.einsum("bxia,abxy,byja->bxiyj", factor, correlation, factor)
+        along = torch.einsum("bxia,abxy,byja->bxiyj", factor, self._along(time, time), factor)
         return along.flatten(3).flatten(1, 2) + common @ common.mT
 
 
@@ -266,10 +272,6 @@ class TrajectoryRegressor(TimedMovement):
 
     def _joint(self, time: Floats, mean: Floats, covariance: Floats) -> JointNormal:
         return self.module_.joint(*map(torch.from_numpy, (time, mean, covariance)))
-
-    def _between(self, time: Floats, other: Floats) -> Tensor:
-        kernel, both = self.module_.time_kernel, (torch.from_numpy(self._scaled(part)) for part in (time, other))
-        return kernel.share * kernel.correlation(*both)
 
     def _rows(self, time: Floats) -> tuple[Floats, Floats]:
         return self._regressor_rows(time) if self._is_regressor else super()._rows(time)
