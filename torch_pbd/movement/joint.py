@@ -89,7 +89,7 @@ class JointNormal:
 
     def marginal(self) -> Float[Tensor, "n d d"]:
         """Covariance of the outputs at each step."""
-        variance = self.along(self.time[:1], self.time[:1])[..., 0] - self.taken.square().sum(2)
+        variance = self.along(self.time[:1], self.time[:1]).sum(2) - self.taken.square().sum(2)
         inner = self.loadings @ self.loadings.mT
         inner.diagonal(dim1=1, dim2=2).add_(variance.mT)
         whole = symmetrize(self.factor @ inner @ self.factor.mT - self.explained @ self.explained.mT)
