@@ -12,7 +12,7 @@ from torch import Tensor
 from torch_pbd.linalg import safe_cholesky, spectral_map, symmetrize
 
 Along = Callable[[Tensor, Tensor], Tensor]
-"""Correlation R between times (n,) and others (m,), (c, n, m); of each with itself the same."""
+"""Correlation R between times (n,) and others (m,): (c, n, m)."""
 
 
 @dataclass(frozen=True)
@@ -30,14 +30,17 @@ class JointNormal:
     factor: Float[Tensor, "n d d"]  # A
     time: Float[Tensor, " n"]
     along: Along
+    variance: Float[Tensor, ""]  # R's diagonal
     loadings: Float[Tensor, "n d k"]  # U
     taken: Float[Tensor, "c n m"]  # W
     explained: Float[Tensor, "n d p"]  # V
 
     @classmethod
-    def prior(cls, mean: Tensor, factor: Tensor, time: Tensor, along: Along, loadings: Tensor) -> "JointNormal":
+    def prior(
+        cls, mean: Tensor, factor: Tensor, time: Tensor, along: Along, variance: Tensor, loadings: Tensor
+    ) -> "JointNormal":
         """Law before anything is observed."""
-        return cls(mean, factor, time, along, loadings, mean.new_zeros(1, len(mean), 0), loadings[..., :0])
+        return cls(mean, factor, time, along, variance, loadings, mean.new_zeros(1, len(mean), 0), loadings[..., :0])
 
     @classmethod
     def with_noise(
@@ -49,7 +52,7 @@ class JointNormal:
     ) -> "JointNormal":
         """Law of ``mean_t + loadings_t c`` plus noise of this scale, independent in all steps and outputs."""
         factor = scale.diag().expand(*mean.shape, len(scale))
-        return cls.prior(mean, factor, time, _independent, loadings / scale[:, None])
+        return cls.prior(mean, factor, time, _independent, mean.new_ones(()), loadings / scale[:, None])
 
     @cached_property
     def _correlation(self) -> Float[Tensor, "c n n"]:
@@ -64,7 +67,7 @@ class JointNormal:
     def at(self, steps: Int[Tensor, " m"]) -> "JointNormal":
         """Law of the selected steps."""
         rows = {name: getattr(self, name)[steps] for name in ("mean", "factor", "time", "loadings", "explained")}
-        return JointNormal(along=self.along, taken=self.taken[:, steps], **rows)
+        return replace(self, taken=self.taken[:, steps], **rows)
 
     def columns(self, steps: Int[Tensor, " m"]) -> Float[Tensor, "c n m"]:
         """Columns of R at these steps."""
@@ -74,7 +77,7 @@ class JointNormal:
         """Law of the steps of two unobserved laws, whose correlation is the same."""
         names = ("mean", "factor", "time", "loadings")
         mean, factor, time, loadings = (torch.cat([getattr(law, name) for law in (self, other)]) for name in names)
-        return JointNormal.prior(mean, factor, time, self.along, loadings)
+        return JointNormal.prior(mean, factor, time, self.along, self.variance, loadings)
 
     def covariance(self) -> Float[Tensor, "n d n d"]:
         """Covariance of all outputs at all steps."""
@@ -89,13 +92,14 @@ class JointNormal:
 
     def marginal(self) -> Float[Tensor, "n d d"]:
         """Covariance of the outputs at each step."""
-        variance = self.along(self.time[:1], self.time[:1]).sum(2) - self.taken.square().sum(2)
+        variance = self.variance - self.taken.square().sum(2)
         inner = self.loadings @ self.loadings.mT
         inner.diagonal(dim1=1, dim2=2).add_(variance.mT)
         whole = symmetrize(self.factor @ inner @ self.factor.mT - self.explained @ self.explained.mT)
-        # Rounding may leave less than nothing of the variance of what was observed exactly.
-        singular = torch.linalg.cholesky_ex(whole).info > 0
-        whole[singular] = spectral_map(whole[singular], lambda variance: variance.clamp_min(0.0))
+        # Rounding may leave less than nothing of the variance of what was observed exactly, but for whole steps.
+        singular = (torch.linalg.cholesky_ex(whole).info > 0) & whole.flatten(1).any(1)
+        if bool(singular.any()):
+            whole[singular] = spectral_map(whole[singular], lambda variance: variance.clamp_min(0.0))
         return whole
 
     def log_density(self, x: Float[Tensor, "n d"], df: float) -> float:

@@ -58,8 +58,9 @@ class TimeKernel(nn.Module):
 
     def correlation(self, time: Float[Tensor, "*b n"], other: Float[Tensor, "*b m"]) -> Float[Tensor, "d *b n m"]:
         """Correlation between any times; nuggets are linear between steps, and equal times have correlation 1."""
-        own, nugget = (_interpolated(self.grid, self.nugget, part) for part in (time, other))
-        whole = self._correlation(time, other)
+        parts = torch.stack([self.nugget, self.fine])
+        (own, fine), (nugget, other_fine) = (_interpolated(self.grid, parts, part) for part in (time, other))
+        whole = smooth_correlation(time, other, self.scales, fine, other_fine, self.kernel)
         whole = whole + torch.where(time[..., None] == other[..., None, :], nugget[..., None, :], 0.0)
         return (1.0 + own).rsqrt()[..., None] * whole * (1.0 + nugget).rsqrt()[..., None, :]
 

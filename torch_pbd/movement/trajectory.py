@@ -67,7 +67,7 @@ class TrajectoryLaw(nn.Module):
         """Joint law at times that are all different, of these marginals."""
         time = (x - self.x_shift) / self.x_scale
         factor, loadings = self._parts(time, covariance)
-        return JointNormal.prior(mean, factor, time, self._along, loadings)
+        return JointNormal.prior(mean, factor, time, self._along, self.time_kernel.share, loadings)
 
     def _along(self, time: Float[Tensor, "*b n"], other: Float[Tensor, "*b m"]) -> Float[Tensor, "d *b n m"]:
         return self.time_kernel.share * self.time_kernel.correlation(time, other)
