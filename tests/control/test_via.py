@@ -350,6 +350,14 @@ def test_a_left_out_demonstration_is_nearer_to_what_goes_on_from_its_half(name, 
     assert (np.exp(np.mean(closer, axis=0)) < [0.95, 0.9]).all()
 
 
+def test_what_is_known_before_the_start_moves_no_point_within_the_movement(controller):
+    path = controller.predict([[0.0], [0.4], [1.0]])
+    known = controller.condition([-0.1], [path[0] + 0.001]).condition([0.4], [path[1] + 0.005])
+    via, start = known.predict([[1.0]])[0] + 0.01, known.predict([[0.0]])[0] + [0.02, 0.0]
+    plan = known.schedule(rate=100.0, start=start, via=[(1.0, via)]).position
+    np.testing.assert_allclose(plan[[0, 40, 100]], [start, path[1] + 0.005, via], rtol=0, atol=1e-6)
+
+
 def test_a_movement_whose_start_is_known_still_meets_its_via_points(controller):
     known = controller.condition([0.0], [controller.start_])
     bent = known.schedule(rate=100.0, via=[(1.0, [0.22, 0.13])])

@@ -163,6 +163,10 @@ def test_kmp_keeps_all_that_is_known_where_the_reference_has_one_time():
     known = model.condition(near[:1], value[:1])
     worthless = known.condition(near[:1], [[0.9, 0.9]], noise_scale=10.0)
     np.testing.assert_allclose(worthless.predict(X), known.predict(X), atol=1e-3)
+    # Of one output nothing is learned of the other, however often it is seen.
+    many = np.linspace(0.4, 0.6, 100)[:, np.newaxis]
+    one = model.condition(many, np.column_stack([model.predict(many)[:, 0], np.full(100, np.nan)]))
+    np.testing.assert_allclose(one.predict_cov([[0.5]])[0, 1, 1], model.predict_cov([[0.5]])[0, 1, 1], rtol=0.05)
     # Nor is the reference's end for a point beyond it.
     end, beyond = np.array([[1.0]]), model.condition([[5.0]], [[0.0, 0.0]])
     np.testing.assert_allclose(beyond.predict_cov(end), model.predict_cov(end), rtol=1e-6)
@@ -277,12 +281,22 @@ def test_a_fit_that_fails_leaves_what_was_fitted(make):
     before = model.condition([[0.5]], [[0.3, 0.3]]).predict(X)
     with pytest.raises(ValueError, match="groups has one demonstration"):
         model.fit(inputs[:30], np.repeat(y[:30], 2, axis=1), groups=groups[:30])
-    with pytest.raises(ValueError, match=r"X spans 303, but no demonstration more than 1: .* from its own start"):
+    with pytest.raises(
+        ValueError, match=r"X has 6 demonstrations, of which no two overlap from 0 to 303: .* its own start"
+    ):
         model.fit(inputs + 60.4 * groups[:, np.newaxis], y, groups=groups)  # stamps of a clock
     np.testing.assert_array_equal(model.condition([[0.5]], [[0.3, 0.3]]).predict(X), before)
     assert not make()._known.time.size
     with pytest.raises(NotFittedError):
         make().score(inputs, y, groups=groups)
+
+
+@pytest.mark.parametrize("make", [TrajectoryRegressor, ProMPBaseline, KMPBaseline])
+def test_demonstrations_may_show_parts_of_a_movement(make):
+    inputs, y, groups = stacked(movements(9))
+    shown = np.abs(inputs[:, 0] - np.linspace(0.2, 0.8, 9)[groups]) <= 0.2
+    model = make().fit(inputs[shown], y[shown], groups=groups[shown])
+    assert np.isfinite(model.predict(X)).all()
 
 
 @pytest.mark.parametrize("make", [TrajectoryRegressor, ProMPBaseline])

@@ -105,7 +105,8 @@ class Planning(BaseEstimator):
         """Fitted copy, conditioned on passing positions: a via point, the part observed so far, or a push.
 
         All of the movement and its gains follow by the demonstrations' correlation, what lies before too, smoothly:
-        positions with noise are passed as near as is likely. ``covariance`` must be a model of whole movements, with
+        positions with noise are passed as near as its smooth part is likely to, at a start that all demonstrations
+        share not near; with 0 they are passed exactly. ``covariance`` must be a model of whole movements, with
         variability="position". A copy can be conditioned again.
 
         Parameters

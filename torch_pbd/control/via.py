@@ -21,7 +21,7 @@ from torch_pbd.checks import Floats
 from torch_pbd.exceptions import InvalidParameterError
 
 _N_KNOTS = 200  # knots of a change over a movement, whose length scales are at least a fiftieth of it
-_BESIDE = 1e-3  # share of their distance by which these are beside an observed time
+_BESIDE = 1e-4  # share of their distance by which these are beside an observed time
 # Standard deviations beyond which nobody deviates: steps of left-out demonstrations were up to 23 away.
 _FAR = 30.0
 _AGREE = 1e-4  # share of the movement's extent by which points at one time may differ: 30 um of 0.3 m
@@ -66,27 +66,34 @@ def conditioned(
     result = copy.copy(controller)
     result.covariance_, result._shown = bent, shown
     result.reproduction_ = copy.copy(controller.reproduction_)
-    # At observed times the models predict a step's independent part too, trembling or noise, of which a plan would be a
-    # kink: the change is smooth, of times between, and what is then left at exact points goes from rest to rest.
-    even, known = np.linspace(0.0, controller.duration_, _N_KNOTS), controller.reproduction_.time_of(bent._known.time)
+    result.reproduction_.bend = _smooth(result, moved, pins, _in_model(controller, np.array(pins)))
+    return result
+
+
+def _smooth(controller: Any, moved: Any, pins: Sequence[float], pinned: Floats) -> CubicSpline:
+    """Change of a conditioned controller's path, over movement time, that keeps it at places ``pinned`` (m, d).
+
+    At observed times models predict a step's independent part too, trembling or noise, of which a plan would be a kink:
+    the change is that of the times beside them, and what is then left at exact points goes from rest to rest.
+    """
+    outputs, reproduction = controller.outputs_, controller.reproduction_
+    bent, shown = controller.covariance_, controller._shown
+    even, known = np.linspace(0.0, controller.duration_, _N_KNOTS), reproduction.time_of(bent._known.time)
     beside = np.abs(even[:, np.newaxis] - np.append(known, pins)).min(axis=1, initial=np.inf) < _BESIDE * even[1]
-    between = even + np.where(even > 0.5 * even[-1], -_BESIDE, _BESIDE) * even[1] * beside
-    smooth = CubicSpline(between, outputs.decode(moved.predict(phase(between)) - shown.predict(phase(between))))
+    inputs = reproduction.phase(even + np.where(even > 0.5 * even[-1], -_BESIDE, _BESIDE) * even[1] * beside)
+    smooth = CubicSpline(even, outputs.decode(moved.predict(inputs) - shown.predict(inputs)))
     exact = bent._known.exact.any(axis=1) & (np.abs(known - 0.5 * even[-1]) <= 0.5 * even[-1] + _rounding(controller))
     at = np.append(known[exact], pins).clip(0.0, even[-1])
-    inputs = np.concatenate([bent._known.time[exact, np.newaxis], stays])
+    if not len(at):
+        return smooth
     aims = np.where(bent._known.exact, bent._known.value, np.nan)[exact].reshape(-1, controller.n_outputs_)
-    left = (
-        np.concatenate([aims, _in_model(controller, np.array(pins))])
-        - outputs.decode(shown.predict(inputs))
-        - smooth(at)
-    )
-    far = np.abs(even[:, np.newaxis] - at).min(axis=1, initial=np.inf) > 0.25 * even[1]
+    inputs = np.concatenate([bent._known.time[exact, np.newaxis], reproduction.phase(np.array(pins))])
+    left = np.concatenate([aims, pinned]) - outputs.decode(shown.predict(inputs)) - smooth(at)
+    far = np.abs(even[:, np.newaxis] - at).min(axis=1) > 0.25 * even[1]
     knots = np.unique(np.append(even[far], at))
     knots = knots[np.diff(knots, prepend=-np.inf) > _rounding(controller)]
-    changes = smooth(knots) + _rest_to_rest(result, list(zip(at.tolist(), left, strict=True)), knots)
-    result.reproduction_.bend = CubicSpline(knots, changes)
-    return result
+    changes = smooth(knots) + _rest_to_rest(controller, list(zip(at.tolist(), left, strict=True)), knots)
+    return CubicSpline(knots, changes)
 
 
 def _in_model(controller: Any, time: Floats) -> Floats:
@@ -257,7 +264,12 @@ def _known_points(controller: Any) -> list[_Point]:
     rows = zip(
         times.tolist(), known.exact.reshape(-1, controller.n_outputs_), reproduction.motion(times)[0], strict=True
     )
-    return [_Point("what is known", at, np.where(exact, place, np.nan)) for at, exact, place in rows if exact.any()]
+    ends = -_rounding(controller), controller.duration_ + _rounding(controller)
+    return [
+        _Point("what is known", at, np.where(exact, place, np.nan))
+        for at, exact, place in rows
+        if exact.any() and ends[0] <= at <= ends[1]
+    ]
 
 
 def _distinct(given: list[_Point], fixed: list[_Point], controller: Any) -> list[_Point]:

@@ -21,8 +21,6 @@ from torch_pbd.files.memory import require_much
 from torch_pbd.linalg import log_density
 from torch_pbd.movement.law import MovementLaw, as_recordings, semidefinite_root
 
-_STAMPS = 2.0  # durations of the longest demonstration that all may span: stamps of a clock span more
-
 
 class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
     """Base of the models of whole movements; not for direct use."""
@@ -45,8 +43,8 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         Raises
         ------
         ValueError
-            If X has more than one column, y or groups are missing, there is only one demonstration, all span twice
-            the longest, as stamps of a clock do, or a parameter is invalid.
+            If X has more than one column, y or groups are missing, there is only one demonstration, no two overlap,
+            as by stamps of a clock, or a parameter is invalid.
         """
         # Of a copy, so that a fit that fails leaves no mixture of two.
         fitted = copy.copy(self)
@@ -65,11 +63,11 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         times = [time for time, _ in recordings]
         low, width = float(np.concatenate(times).min()), float(np.ptp(np.concatenate(times)))
         self._range = low, checks.number(width, "the range of X", above=0.0)
-        longest = max(map(np.ptp, times))
-        if width > _STAMPS * longest:
+        starts, ends = (np.sort([time[i] for time in times]) for i in (0, -1))
+        if (starts[1:] >= ends[:-1]).all():
             raise ValueError(
-                f"X spans {width:.6g}, but no demonstration more than {longest:.6g}: they would be parts of one long "
-                "movement. Count the times of each from its own start, or give its phase from 0 to 1."
+                f"X has {len(times)} demonstrations, of which no two overlap from {starts[0]:.10g} to {ends[-1]:.10g}: "
+                "they would be parts of one long movement. Count the times of each from its own start."
             )
         self._fit(recordings)
 
@@ -207,34 +205,31 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         checks.count(n_samples, "n_samples")
         generator, time = checks.seed(random_state), self._times(X)
         weight, parts = self._components(time)
-        samples = np.empty((len(time), self.n_outputs_, n_samples))
-        drawn = generator.choice(len(weight), (len(time), n_samples), p=weight)
+        size, degrees = (len(time), self.n_outputs_, n_samples), self.predict_df(X)[:, np.newaxis, np.newaxis]
+        normal, samples = generator.standard_normal(size), np.empty(size)
+        if np.isfinite(degrees).all():
+            normal *= np.sqrt((degrees - 2.0) / generator.chisquare(degrees, (len(time), 1, n_samples)))
+        drawn = generator.choice(len(weight), (len(time), 1, n_samples), p=weight)
         for number, (law, own) in enumerate(parts):
             mean, covariance = by_chunks(law._rows, own)
-            degrees, (rows, columns) = law.predict_df(own[:, np.newaxis]), (drawn == number).nonzero()
-            normal = generator.standard_normal((len(rows), self.n_outputs_, 1))
-            deviation = (semidefinite_root(covariance)[rows] @ normal)[..., 0]
-            if np.isfinite(degrees).all():
-                degrees = degrees[rows]
-                deviation *= np.sqrt((degrees - 2.0) / generator.chisquare(degrees))[:, np.newaxis]
-            samples[rows, :, columns] = mean[rows] + deviation
+            np.copyto(samples, mean[..., np.newaxis] + semidefinite_root(covariance) @ normal, where=drawn == number)
         return samples[:, 0] if self._y_is_1d else samples
 
     def log_likelihood(self, X: ArrayLike, y: ArrayLike) -> Floats:
-        """Marginal log density (n_samples,) of each row of y at X, in nats."""
+        """Marginal log density (n_samples,) of each row of y at X, in nats.
+
+        With unknown timing it is that of a Student's t with the moments of the mixture.
+        """
         check_is_fitted(self)
         X, targets = checked_rows(self, X, y, reset=False)
         if targets[0].size != self.n_outputs_:
             raise ValueError(f"y has {targets[0].size} outputs, but the model was fitted with {self.n_outputs_}.")
-        return self._row_scores(self._times(X), targets.reshape(len(X), -1))
-
-    def _row_scores(self, time: Floats, position: Floats) -> Floats:
-        """Log density of each row by itself."""
-        if self._is_known(time).any():
-            raise ValueError("X has a row that is known without noise: it has no density. Leave it out.")
+        time = self._times(X)
         mean, covariance = map(torch.from_numpy, self._marginals(time))
-        degrees = torch.from_numpy(self.predict_df(time[:, np.newaxis]))
-        residual, root = torch.from_numpy(position) - mean, torch.linalg.cholesky(covariance)
+        root, info = torch.linalg.cholesky_ex(covariance)
+        if info.any() or self._is_known(time).any():
+            raise ValueError("X has a row that is known without noise, or with hardly any: it has no density there.")
+        residual, degrees = torch.from_numpy(targets).reshape(mean.shape) - mean, torch.from_numpy(self.predict_df(X))
         return log_density(residual, root, degrees if degrees.isfinite().all() else None).numpy()
 
     def _is_known(self, time: Floats) -> NDArray[np.bool_]:

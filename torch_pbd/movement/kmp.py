@@ -21,6 +21,7 @@ from torch_pbd.movement.joint import Conditioned, JointNormal
 from torch_pbd.movement.law import as_rows, check_arrays, check_regressor, semidefinite_root
 
 _ARRAYS = ("reference.time", "reference.mean", "reference.covariance", "range", "shift", "scale")  # in model files
+_NOTHING = 1e6  # variance of an output of which nothing is said, of standardized outputs
 _LEAST = 1e-6  # least variance in the reference, of standardized outputs; the paper's of a point without noise
 
 
@@ -80,7 +81,7 @@ class KMPBaseline(MovementRegressor):
         for name in ("length_scale", "lambda_mean", "lambda_cov", "nugget"):
             checks.number(getattr(self, name), name, above=0.0)
         checks.seed(self.random_state)
-        check_regressor(self.regressor)
+        check_regressor(self.regressor, "predict")
 
     def _fit(self, recordings: list[Demonstration]) -> None:
         X, y, groups = as_rows(recordings)
@@ -134,6 +135,9 @@ class KMPBaseline(MovementRegressor):
         """
         reference, means, covariances = self._with_via_points()
         n_reference, d = means.shape
+        require_much(
+            4 * 8.0 * (n_reference * d) ** 2, what=f"{n_reference} points of {d} outputs", remedy="Give fewer."
+        )
         gram, noise = np.kron(self._kernel(reference, reference), np.eye(d)), block_diag(*covariances)
         weights = np.linalg.solve(gram + self.lambda_mean * noise, means.ravel()).reshape(n_reference, d)
         root = np.linalg.cholesky(gram + self.lambda_cov * noise)
@@ -152,21 +156,23 @@ class KMPBaseline(MovementRegressor):
             return self._reference
         axes, shift = self._observed_axes * self._scale, self._observed_axes @ self._shift
         reference, means, covariances = self._reference
-        least = _LEAST * np.square(axes).sum(axis=1)
-        distance = np.abs(self._known.time[:, np.newaxis] - reference)
+        at, value, noise = self._known
+        given, distance = ~np.isnan(value), np.abs(at[:, np.newaxis] - reference)
         nearest = distance.argmin(axis=1)
-        place, spread = means[nearest] @ axes.T, axes @ covariances[nearest] @ axes.T
-        for mean, covariance, value, noise in zip(place, spread, *self._known[1:], strict=True):
-            given = ~np.isnan(value)
-            mean[given] = (value - shift)[given]
-            covariance[given] = covariance[:, given] = 0.0
-            covariance[given, given] = np.maximum(np.square(noise), least)[given]
-        back = np.linalg.inv(axes)
         is_near = distance.min(axis=1) <= (0.5 + checks.ROUNDING) * (reference[1] - reference[0])
-        kept = np.setdiff1d(np.arange(len(reference)), nearest[is_near])
-        pairs = (reference, self._known.time), (means, place @ back.T), (covariances, back @ spread @ back.T)
-        time, means, covariances = (np.concatenate([old[kept], new]) for old, new in pairs)
-        return time, means, covariances
+        taken = np.zeros_like(means, dtype=bool)
+        np.logical_or.at(taken, nearest[is_near], given[is_near])
+        # An output that is given takes the place of the reference's; what is not said has a variance without bound.
+        unit = np.square(axes).sum(axis=1)
+        covariances = axes @ covariances @ axes.T * ~taken[:, np.newaxis] * ~taken[:, :, np.newaxis]
+        covariances += (_NOTHING * unit * taken)[:, np.newaxis] * np.eye(len(unit))
+        own = np.where(given, np.maximum(np.square(noise), _LEAST * unit), _NOTHING * unit)[:, np.newaxis] * np.eye(
+            len(unit)
+        )
+        back, kept = np.linalg.inv(axes), ~taken.all(axis=1)
+        means = np.concatenate([(means @ axes.T)[kept], np.where(given, value - shift, 0.0)])
+        covariances = back @ np.concatenate([covariances[kept], own]) @ back.T
+        return np.concatenate([reference[kept], at]), means @ back.T, covariances
 
     def _conditioned(self, time: Floats) -> tuple[Conditioned, torch.Tensor]:
         # Via points are in the reference, so nothing is conditioned on.

@@ -270,7 +270,7 @@ def check_arrays(arrays: dict[str, Floats], shapes: dict[str, tuple[int | str, .
         checks.array(arrays[name], name, shape)
 
 
-def check_regressor(regressor: Any) -> None:
-    """Check that a parameter is None or an estimator of mean and covariance."""
-    if regressor is not None and (isinstance(regressor, type) or not hasattr(regressor, "predict_df")):
+def check_regressor(regressor: Any, method: str) -> None:
+    """Check that a parameter is None or an estimator that has a method."""
+    if regressor is not None and (isinstance(regressor, type) or not hasattr(regressor, method)):
         raise checks.refusal(regressor, "regressor", "a covariance regressor or None")

@@ -110,12 +110,6 @@ class TimedMovement(MovementRegressor):
 
         return self._log_density(self._known.and_also(time, position, np.zeros_like(position)), exact)
 
-    def _row_scores(self, time: Floats, position: Floats) -> Floats:
-        if self._timing is None:
-            return super()._row_scores(time, position)
-        # The posterior's nodes are too far apart for the density of a row: there are those of the row itself.
-        return np.array([self._score(time[row : row + 1], position[row : row + 1]) for row in range(len(time))])
-
     def _log_density(self, whole: Known, exact: Likelihood | None = None, duration: float | None = None) -> float:
         """Log density of what goes beyond the observations: its mean over movements that run to the end of it."""
         last = self._last(whole.time)

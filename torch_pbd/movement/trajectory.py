@@ -176,7 +176,7 @@ class TrajectoryRegressor(TimedMovement):
             checks.number(self.shrinkage, "shrinkage", least=0.0, most=0.95)
         checks.choice(self.timing, "timing", ("none", "warp", "auto"))
         checks.seed(self.random_state)
-        check_regressor(self.regressor)
+        check_regressor(self.regressor, "predict_df")
 
     def _fit(self, recordings: list[Demonstration]) -> None:
         for number, recording in enumerate(recordings):
