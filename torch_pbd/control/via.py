@@ -217,7 +217,7 @@ def _rest_to_rest(controller: Any, beyond: list[tuple[float, Floats]], time: Flo
     still = np.append(controller.reproduction_.time_of(known.time).clip(0.0, duration), [0.0, duration])
     for output in range(controller.n_outputs_):
         own = {at: change[output] for at, change in beyond if not np.isnan(change[output])}
-        # A via point takes the place of an end, and of what was known with noise.
+        # A via point takes the place of an end, and of what was known with noise, whose times come back from phases.
         kept = (np.abs(still[:, np.newaxis] - [*own]) > _BESIDE * duration / _N_KNOTS).all(axis=1)
         kept[:-2] &= is_known[:, output]
         own |= dict.fromkeys(still[kept].tolist(), 0.0)

@@ -49,12 +49,13 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         # Of a copy, so that a fit that fails leaves no mixture of two.
         fitted = copy.copy(self)
         fitted.__dict__.pop("_known", None)
+        fitted._check_parameters()
         fitted._fit_recordings(as_recordings(fitted, X, y, groups, is_fit=True))
         self.__dict__ = fitted.__dict__
         return self
 
     def _fit_recordings(self, recordings: list[Demonstration]) -> None:
-        self._check_parameters()
+        """Check that these show a movement, and fit to them."""
         if len(recordings) < 2:
             raise ValueError(
                 "groups has one demonstration, must have two or more: how whole movements differ is not seen in one. "
