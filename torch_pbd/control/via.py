@@ -57,16 +57,17 @@ def conditioned(
     outputs, phase = controller.outputs_, controller.reproduction_.phase
     # Observations are in outputs, any of which may be free, while poses are learned along other axes.
     model = controller.covariance_.observed_along(outputs.axes)
-    shown, inputs, stays = getattr(controller, "_shown", model), phase(time), phase(np.array(pins))
-    bent = model.condition(inputs, _in_model(controller, time) + change, noise_scale=noise_scale)
+    place, covariance = _in_model(controller, np.append(time, pins))
+    bent = model.condition(phase(time), place[: len(time)] + change, noise_scale=noise_scale)
     if len(time):
-        _warn_of_far(controller, time, change, outputs.covariance(shown.predict_cov(inputs)), noise_scale)
+        _warn_of_far(controller, time, change, covariance[: len(time)], noise_scale)
     # Pins are where the model has them: the path, smooth, may be off by what is many of its deviations at an end.
+    stays = phase(np.array(pins))
     moved = bent.condition(stays, outputs.decode(model.predict(stays))) if len(pins) else bent
     result = copy.copy(controller)
-    result.covariance_, result._shown = bent, shown
+    result.covariance_, result._shown = bent, getattr(controller, "_shown", model)
     result.reproduction_ = copy.copy(controller.reproduction_)
-    result.reproduction_.bend = _smooth(result, moved, pins, _in_model(controller, np.array(pins)))
+    result.reproduction_.bend = _smooth(result, moved, pins, place[len(time) :])
     return result
 
 
@@ -81,14 +82,15 @@ def _smooth(controller: Any, moved: Any, pins: Sequence[float], pinned: Floats) 
     even, known = np.linspace(0.0, controller.duration_, _N_KNOTS), reproduction.time_of(bent._known.time)
     beside = np.abs(even[:, np.newaxis] - np.append(known, pins)).min(axis=1, initial=np.inf) < _BESIDE * even[1]
     inputs = reproduction.phase(even + np.where(even > 0.5 * even[-1], -_BESIDE, _BESIDE) * even[1] * beside)
-    smooth = CubicSpline(even, outputs.decode(moved.predict(inputs) - shown.predict(inputs)))
     exact = bent._known.exact.any(axis=1) & (np.abs(known - 0.5 * even[-1]) <= 0.5 * even[-1] + _rounding(controller))
     at = np.append(known[exact], pins).clip(0.0, even[-1])
+    there = [inputs, bent._known.time[exact, np.newaxis], reproduction.phase(np.array(pins))]
+    before, here = np.split(outputs.decode(shown.predict(np.concatenate(there))), [_N_KNOTS])
+    smooth = CubicSpline(even, outputs.decode(moved.predict(inputs)) - before)
     if not len(at):
         return smooth
     aims = np.where(bent._known.exact, bent._known.value, np.nan)[exact].reshape(-1, controller.n_outputs_)
-    inputs = np.concatenate([bent._known.time[exact, np.newaxis], reproduction.phase(np.array(pins))])
-    left = np.concatenate([aims, pinned]) - outputs.decode(shown.predict(inputs)) - smooth(at)
+    left = np.concatenate([aims, pinned]) - here - smooth(at)
     far = np.abs(even[:, np.newaxis] - at).min(axis=1) > 0.25 * even[1]
     knots = np.unique(np.append(even[far], at))
     knots = knots[np.diff(knots, prepend=-np.inf) > _rounding(controller)]
@@ -96,11 +98,15 @@ def _smooth(controller: Any, moved: Any, pins: Sequence[float], pinned: Floats) 
     return CubicSpline(knots, changes)
 
 
-def _in_model(controller: Any, time: Floats) -> Floats:
-    """Places (n, d) of the path at movement times (n,), but for the error of its reproduction of the model's mean."""
+def _in_model(controller: Any, time: Floats) -> tuple[Floats, Floats]:
+    """Places (n, d) of the path at movement times (n,), and the covariances there before anything was known.
+
+    But for the error of the path's reproduction of the model's mean.
+    """
     shown, reproduction = getattr(controller, "_shown", controller.covariance_), controller.reproduction_
-    mean = controller.outputs_.decode(shown.predict(reproduction.phase(time)))
-    return mean if reproduction.bend is None else mean + reproduction.bend(time.clip(0.0, controller.duration_))
+    mean, covariance = shown.predict(reproduction.phase(time), return_cov=True)
+    bend = 0.0 if reproduction.bend is None else reproduction.bend(time.clip(0.0, controller.duration_))
+    return controller.outputs_.decode(mean) + bend, controller.outputs_.covariance(covariance)
 
 
 def _warn_of_far(controller: Any, time: Floats, change: Floats, covariance: Floats, noise_scale: ArrayLike) -> None:
@@ -185,10 +191,8 @@ class _Likely:
     def add(self, at: float, change: Floats, name: str = "") -> Floats:
         """What of a change, NaN where free, is beyond 95 % of demonstrations; if a named point's is, it warns."""
         inputs, given = self._controller.reproduction_.phase(np.array([at])), ~np.isnan(change)
-        before, now = (
-            _in_model(self._controller, np.array([at]))[0],
-            self._outputs.decode(self._model.predict(inputs))[0],
-        )
+        before = _in_model(self._controller, np.array([at]))[0][0]
+        now = self._outputs.decode(self._model.predict(inputs))[0]
         left, size = change - (now - before), int(given.sum())
         covariance = self._outputs.covariance(self._model.predict_cov(inputs))[0][np.ix_(given, given)]
         degrees = min(float(self._model.predict_df(inputs)[0]), 1e12)  # infinite ones are not for f
