@@ -130,15 +130,17 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         the times of the fit and 1 beyond them. ``type2`` is the variability given observations.
         """
         weight, parts = self._components(self._times(X))
-        mean, type1, type2 = zip(*(by_chunks(law._uncertainty, own) for law, own in parts), strict=True)
-        moments = list(zip(mean, type2, strict=True))
-        return Uncertainty(weight @ np.stack(type1), mixed(weight, moments, "kia,kib->iab")[1])
+        type1, type2 = zip(*(by_chunks(law._uncertainty, own) for law, own in parts), strict=True)
+        if len(parts) == 1:
+            return Uncertainty(type1[0], type2[0])
+        means = [by_chunks(law._rows, own)[0] for law, own in parts]
+        variability = mixed(weight, list(zip(means, type2, strict=True)), "kia,kib->iab")[1]
+        return Uncertainty(weight @ np.stack(type1), variability)
 
-    def _uncertainty(self, time: Floats) -> tuple[Floats, Floats, Floats]:
-        """Mean, Type I uncertainty and variability of each row under one component."""
+    def _uncertainty(self, time: Floats) -> tuple[Floats, Floats]:
+        """Type I uncertainty and variability of each row under one component."""
         scaled = self._rounded(time)
-        mean, covariance = self._rows(time)
-        return mean, ((scaled < 0.0) | (scaled > 1.0)).astype(np.float64), covariance
+        return ((scaled < 0.0) | (scaled > 1.0)).astype(np.float64), self._rows(time)[1]
 
     def predict_joint(self, X: ArrayLike) -> tuple[Floats, Floats]:
         """Joint mean and covariance of a new demonstration at the rows of X.

@@ -1,6 +1,6 @@
 """The joint law of a demonstration, on top of any covariance regressor."""
 
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import partial
 from typing import Any, ClassVar
 
@@ -66,26 +66,29 @@ class TrajectoryLaw(nn.Module):
     ) -> JointNormal:
         """Joint law at times that are all different, of these marginals."""
         time = (x - self.x_shift) / self.x_scale
-        factor, loadings = self._parts(time, covariance)
+        loadings = self._loadings(time)
+        factor = self.factor(loadings, covariance)
         return JointNormal.prior(mean, factor, time, self._along, self.time_kernel.share, loadings)
 
     def _along(self, time: Float[Tensor, "*b n"], other: Float[Tensor, "*b m"]) -> Float[Tensor, "d *b n m"]:
         return self.time_kernel.share * self.time_kernel.correlation(time, other)
 
-    def _parts(self, time: Float[Tensor, " m"], covariance: Float[Tensor, "m d d"]) -> tuple[Tensor, Tensor]:
-        """A (m, d, d) and loadings (m, d, k) of movements at m times in all, in ranges of those of the fit."""
+    def _loadings(self, time: Float[Tensor, " m"]) -> Float[Tensor, "m d k"]:
+        """Demonstrations' own correlation at times in ranges of those of the fit."""
         kernel = self.time_kernel
-        loadings = ((1.0 - kernel.share) / len(kernel.residual)).sqrt() * kernel.loadings(time)
-        # A_t divides by the factor of S_tt, so that the blocks of the joint law are those of the marginals.
-        own = loadings @ loadings.mT + kernel.share * torch.eye(len(self.order)).to(loadings)
+        return ((1.0 - kernel.share) / len(kernel.residual)).sqrt() * kernel.loadings(time)
+
+    def factor(self, loadings: Float[Tensor, "m d k"], covariance: Float[Tensor, "m d d"]) -> Float[Tensor, "m d d"]:
+        """A of steps with these loadings: it divides by the factor of S_tt, so that blocks are the marginals C_t."""
+        own = loadings @ loadings.mT + self.time_kernel.share * torch.eye(len(self.order)).to(loadings)
         root = root_in_order(covariance, self.order)
-        factor = torch.linalg.solve_triangular(torch.linalg.cholesky(own), root, upper=False, left=False)
-        return factor, loadings
+        return torch.linalg.solve_triangular(torch.linalg.cholesky(own), root, upper=False, left=False)
 
     def covariances(self, x: Float[Tensor, "b n"], covariance: Float[Tensor, "m d d"]) -> Float[Tensor, "b n*d n*d"]:
         """Covariances of several movements, each at few times of its own."""
         time = (x - self.x_shift) / self.x_scale
-        factor, loadings = self._parts(time.flatten(), covariance)
+        loadings = self._loadings(time.flatten())
+        factor = self.factor(loadings, covariance)
         factor, common = factor.unflatten(0, x.shape), (factor @ loadings).unflatten(0, x.shape).flatten(1, 2)
         along = torch.einsum("bxia,abxy,byja->bxiyj", factor, self._along(time, time), factor)
         return along.flatten(3).flatten(1, 2) + common @ common.mT
@@ -234,13 +237,15 @@ class TrajectoryRegressor(TimedMovement):
         """Whether the marginals at X are those of the regressor."""
         return self._timing is None and not len(self._known.time)
 
-    def _uncertainty(self, time: Floats) -> tuple[Floats, Floats, Floats]:
+    def _uncertainty(self, time: Floats) -> tuple[Floats, Floats]:
         union, rows, places = self._union(time, self._known.time)
         type1, type2 = self.regressor_.predict_uncertainty(union[:, np.newaxis])
         if not self._is_regressor:
-            law = self._given(self._joint(union, self._regressor_rows(union)[0], type2), places).law
-            type2 = law.marginal().numpy()
-        return self._rows(time)[0], type1[rows], type2[rows]
+            law, index = self._prior_with(union)
+            law = law.at(torch.from_numpy(index))
+            law = replace(law, factor=self.module_.factor(law.loadings, torch.from_numpy(type2)))
+            type2 = self._given(law, places).law.marginal().numpy()
+        return type1[rows], type2[rows]
 
     def _arrays(self) -> dict[str, Floats]:
         state = self.module_.state_dict().items()
@@ -268,10 +273,7 @@ class TrajectoryRegressor(TimedMovement):
         self._set_law(TimeKernel(self.time_kernel_, **own), torch.tensor(order).long())
 
     def _prior(self, time: Floats) -> JointNormal:
-        return self._joint(time, *self._regressor_rows(time))
-
-    def _joint(self, time: Floats, mean: Floats, covariance: Floats) -> JointNormal:
-        return self.module_.joint(*map(torch.from_numpy, (time, mean, covariance)))
+        return self.module_.joint(*map(torch.from_numpy, (time, *self._regressor_rows(time))))
 
     def _rows(self, time: Floats) -> tuple[Floats, Floats]:
         return self._regressor_rows(time) if self._is_regressor else super()._rows(time)
