@@ -19,7 +19,16 @@ from joblib import Parallel, delayed
 from movement_primitives.promp import ProMP
 from scipy.stats import multivariate_normal, multivariate_t
 
-from torch_pbd import GMMBaseline, KMPBaseline, ProMPBaseline, TrajectoryRegressor, load_demonstrations
+from torch_pbd import (
+    DMPController,
+    GMMBaseline,
+    HeteroscedasticGPRegressor,
+    KMPBaseline,
+    ProMPBaseline,
+    TrajectoryRegressor,
+    load_demonstrations,
+)
+from torch_pbd.data import Demonstrations
 from torch_pbd.experiments.comparison import MOVEMENT_STATISTICS, movement_statistics
 from torch_pbd.metrics import gaussian_kl
 
@@ -325,8 +334,10 @@ def table_of_laws(rows: list[dict[str, Any]]) -> str:
 
 
 def speed(n_demos: int, n: int, d: int) -> str:
-    """CPU times on one thread: of the fit beyond the regressor's, of a hundred draws and a via point, best of five."""
-    torch.set_num_threads(1)
+    """CPU times on one thread, of the fit beyond the regressor's and, best of five, of what is asked of it.
+
+    Of a hundred draws, a via point, a controller that is planned anew, and its schedule of a second at 1 kHz.
+    """
     rng, grid = np.random.default_rng(0), np.linspace(0.0, 1.0, n)
     unit = np.exp(-0.5 * np.square((grid[:, None] - grid) / 0.1)) + 1e-6 * np.eye(n)
     mixed = (np.eye(d) + 0.3 * rng.standard_normal((d, d))) * (0.2 + grid[:, None, None])
@@ -338,7 +349,21 @@ def speed(n_demos: int, n: int, d: int) -> str:
     fit = seconds(lambda: model.fit(*rows, groups=groups), 1) - seconds(lambda: regressor.fit(*rows), 1)
     draws = seconds(lambda: model.sample_demonstrations(at, 100, random_state=0))
     via = seconds(lambda: model.condition(at[half], y[0, half]).predict(at))
-    return f"| {n_demos} x {n} x {d} | {fit:.2f} | {1e3 * draws:.1f} | {1e3 * via:.1f} |"
+    skill = DMPController(model).fit(Demonstrations([grid] * n_demos, list(y)))
+    replanned = seconds(lambda: skill.condition(grid[half], y[0, half]))
+    bent = skill.condition(grid[half], y[0, half])
+    schedule = seconds(lambda: bent.schedule(rate=1000.0, limits=None))
+    cells = " | ".join(f"{1e3 * each:.1f}" for each in (draws, via, replanned, schedule))
+    return f"| {n_demos} x {n} x {d} | {fit:.2f} | {cells} |"
+
+
+def speed_of_outputs(d: int) -> str:
+    """CPU time on one thread of the recommended regressor's fit to outputs of a real set, and its log evidence."""
+    shown = load_demonstrations(DATA / "adroit_door_joints.npz").resample(200)
+    X, y, groups = shown.stack(input="phase")
+    model = HeteroscedasticGPRegressor()
+    fit = seconds(lambda: model.fit(X, y[:, :d], groups=groups), 3)
+    return f"| {d} | {fit:.2f} | {-model.loss_:.1f} |"
 
 
 def seconds(call: Any, n_repetitions: int = 5) -> float:
@@ -349,6 +374,16 @@ def seconds(call: Any, n_repetitions: int = 5) -> float:
         call()
         times.append(time.process_time() - start)
     return min(times)
+
+
+def print_times() -> None:
+    """Print the tables of times."""
+    torch.set_num_threads(1)
+    asked = " | ".join(f"{name} [ms]" for name in ("100 draws", "via point", "planned anew", "1 s of schedule"))
+    print(f"| K x T x d | fit beyond the regressor [s] | {asked} |\n|" + " --- |" * 6)
+    print(speed(6, 100, 2), speed(20, 1000, 14), sep="\n")
+    print("\n| outputs | fit of HeteroscedasticGPRegressor [s] | log evidence |\n|" + " --- |" * 3)
+    print(*(speed_of_outputs(d) for d in (2, 7, 14, 27)), sep="\n")
 
 
 def write(path: Path, rows: list[dict[str, Any]]) -> None:
@@ -371,12 +406,11 @@ def main() -> None:
     parser.add_argument("--folds", type=int, default=N_FOLDS)
     parser.add_argument("--n_train", type=int, default=MOST_TRAINED, help="demonstrations learned from, at most")
     parser.add_argument("--seeds", type=int, default=4, help="of made data; 0 leaves them out")
-    parser.add_argument("--speed", action="store_true", help="print the table of times alone")
+    parser.add_argument("--speed", action="store_true", help="print the tables of times alone")
     parser.add_argument("--n_jobs", type=int, default=2)
     options = parser.parse_args()
     if options.speed:
-        print("| K x T x d | fit beyond the regressor [s] | 100 draws [ms] | via point [ms] |\n|" + " --- |" * 4)
-        print(speed(6, 100, 2), speed(20, 1000, 14), sep="\n")
+        print_times()
         return
     options.output.mkdir(parents=True, exist_ok=True)
     models = [model for model in MODELS if model in {*compared, *options.models}]
