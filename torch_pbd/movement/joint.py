@@ -73,12 +73,6 @@ class JointNormal:
         """Columns of R at these steps."""
         return self.along(self.time, self.time[steps])
 
-    def joined(self, other: "JointNormal") -> "JointNormal":
-        """Law of the steps of two unobserved laws, whose correlation is the same."""
-        names = ("mean", "factor", "time", "loadings")
-        mean, factor, time, loadings = (torch.cat([getattr(law, name) for law in (self, other)]) for name in names)
-        return JointNormal.prior(mean, factor, time, self.along, self.variance, loadings)
-
     def covariance(self) -> Float[Tensor, "n d n d"]:
         """Covariance of all outputs at all steps."""
         # The inner part R - W W' + U U' first, and then a block of A on either side.

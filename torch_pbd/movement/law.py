@@ -62,7 +62,7 @@ class MovementLaw(BaseEstimator, ABC):
     _range: tuple[float, float]  # first of the times of the fit, and their range
     _known: Known = Known(np.empty(0), np.empty((0, 1)), np.empty((0, 1)))
     _axes: Floats | None = None  # axes of the coordinates of observations; None are the outputs
-    _kept: dict[str, tuple[Floats, Any]]  # cached last times and their law, shared by conditioned copies
+    _kept: dict[str, Any]  # cached last times and their law, shared by conditioned copies
     _y_is_1d: bool
 
     @abstractmethod
@@ -163,34 +163,22 @@ class MovementLaw(BaseEstimator, ABC):
     def _conditioned(self, time: Floats) -> tuple[Conditioned, Tensor]:
         """Law at query and observation times given the observations, and the indices of ``time`` among them."""
         union, rows, places = self._union(time, self._known.time)
-        law, index = self._prior_with(union)
-        return self._given(law, index[places]), torch.from_numpy(index[rows])
+        return self._given(self._prior_at(union), places), torch.from_numpy(rows)
 
     def _given(self, law: JointNormal, places: NDArray[np.intp]) -> Conditioned:
         """Law given the observations, which are at these indices among its steps."""
         value, noise = (torch.from_numpy(part.reshape(-1, self.n_outputs_)) for part in self._known[1:])
         return Conditioned(law, torch.from_numpy(places), value, noise, torch.from_numpy(self._observed_axes))
 
-    def _prior_with(self, time: Floats) -> tuple[JointNormal, NDArray[np.intp]]:
-        """Joint law at increasing times, possibly at others too, and their indices in it; the last one is cached."""
+    def _prior_at(self, time: Floats) -> JointNormal:
+        """Joint law at distinct times; the last one is cached."""
+        if len(time) > _MOST_KEPT:
+            return self._prior(time)
         kept = self.__dict__.setdefault("_kept", {})
-        last, law = kept.get("last", (time[:0], None))
-        rounded = self._rounded(last), self._rounded(time)
-        _, place, old = np.intersect1d(*rounded, assume_unique=True, return_indices=True)
-        if 2 * len(old) <= len(time):
-            law = self._prior(time)
-            if 0 < len(time) <= _MOST_KEPT:
-                kept["last"] = time, law
-            return law, np.arange(len(time))
-        if 2 * len(old) < len(last):
-            last, law, place = last[place], law.at(torch.from_numpy(place)), np.arange(len(place))
-        index = np.full(len(time), -1)
-        index[old] = place
-        new = time[index < 0]
-        if len(new):
-            law = law.joined(self._prior(new))
-            index[index < 0] = len(last) + np.arange(len(new))
-        return law, index
+        if not np.array_equal(kept.get("time"), time):
+            kept |= {"law": self._prior(time), "time": time}
+        law: JointNormal = kept["law"]
+        return law
 
     def _copy(self) -> Self:
         """Copy that shares the unconditioned law and its cache."""

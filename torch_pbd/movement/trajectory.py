@@ -241,8 +241,7 @@ class TrajectoryRegressor(TimedMovement):
         union, rows, places = self._union(time, self._known.time)
         type1, type2 = self.regressor_.predict_uncertainty(union[:, np.newaxis])
         if not self._is_regressor:
-            law, index = self._prior_with(union)
-            law = law.at(torch.from_numpy(index))
+            law = self._prior_at(union)
             law = replace(law, factor=self.module_.factor(law.loadings, torch.from_numpy(type2)))
             type2 = self._given(law, places).law.marginal().numpy()
         return type1[rows], type2[rows]
