@@ -6,6 +6,7 @@ from typing import Any, Self
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from torch_pbd import checks
@@ -28,6 +29,8 @@ _SLACK = 1e-3  # share of a duration: where all last equally long, rounding may 
 # Most steps on which the correlation is learned: the nuggets' iterations are cubic in them, and movements are smooth.
 _MOST_STEPS = 200
 _GAP = 2.0  # sample spacings of a recording: a step farther than that from its samples counts as missing
+# Sample spacings: the noise of two samples closer than that, over the time between them, would bend a spline.
+_TOO_CLOSE = 0.1
 
 
 class TimedMovement(MovementRegressor):
@@ -243,9 +246,14 @@ def n_grid_steps(recordings: list[Demonstration]) -> int:
 
 
 def sampled(recording: Demonstration, grid: Floats) -> Floats:
-    """Positions of a recording at the steps of a grid, linear between samples; NaN where no sample is near."""
+    """Values of a recording at the steps of a grid, by a cubic spline; NaN where no sample is near.
+
+    Chords between samples would be off by more than the noise where recordings have times of their own.
+    """
     time, position = recording
-    right = np.clip(np.searchsorted(time, grid), 1, len(time) - 1)
+    right, spacing = np.clip(np.searchsorted(time, grid), 1, len(time) - 1), np.diff(time, prepend=-np.inf)
+    usual = np.median(spacing[1:])
     nearest = np.minimum(np.abs(grid - time[right - 1]), np.abs(time[right] - grid))
-    seen = nearest <= _GAP * np.median(np.diff(time))
-    return np.where(seen[:, np.newaxis], interpolate(time, position, grid), np.nan)
+    apart = spacing > _TOO_CLOSE * usual
+    values = CubicSpline(time[apart], position[apart])(grid.clip(time[0], time[-1]))
+    return np.where((nearest <= _GAP * usual)[:, np.newaxis], values, np.nan)

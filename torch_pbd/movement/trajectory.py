@@ -197,8 +197,13 @@ class TrajectoryRegressor(TimedMovement):
 
         self._range = low, width = float(X.min()), float(np.ptp(X))  # of phases, where timing is unknown
         grid = np.linspace(low, low + width, n_grid_steps(recordings))
-        mean, covariance = self._regressor_rows(grid)
-        residual = np.stack([sampled(recording, grid) for recording in recordings]) - mean
+        covariance = self._regressor_rows(grid)[1]
+        # Deviations bend less than movements between the samples.
+        at, place = np.unique(X[:, 0], return_inverse=True)
+        left = y - self.regressor_.predict(at[:, np.newaxis]).reshape(len(at), -1)[place]
+        each = np.split(left, np.flatnonzero(np.diff(groups)) + 1)
+        own = (Demonstration(time, rows) for (time, _), rows in zip(recordings, each, strict=True))
+        residual = np.stack([sampled(deviation, grid) for deviation in own])
         # z = inv(L_t) (y_t - m_t) has unit covariance at each step; only its correlation along time is to be found.
         order = smoothest_first(torch.from_numpy(residual / np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))))
         root = root_in_order(torch.from_numpy(covariance), order)
