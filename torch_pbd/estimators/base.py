@@ -225,16 +225,13 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator):
         """Log density of each row of y at X, in nats: (n_samples,)."""
         check_is_fitted(self)
         inputs, targets = checked_rows(self, X, y, reset=False)
-        targets = targets.reshape(len(inputs), -1)
-        if targets.shape[1] != self.n_outputs_:
-            raise ValueError(f"y has {targets.shape[1]} outputs, but the model was fitted with {self.n_outputs_}.")
 
         def at(rows: Tensor) -> tuple[Tensor]:
             x, y = rows.tensor_split([self.n_features_in_], dim=1)
             mean, scale_tril = self.module_(x, *self._prior_tril_at(x))
             return (log_density(y - mean, scale_tril, self.module_.degrees(x)),)
 
-        return self._arrays(at, np.hstack([inputs, targets]))[0]
+        return self._arrays(at, np.column_stack([inputs, targets]))[0]
 
     def score(self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None) -> float:
         """Mean log density of the rows of y at X, in nats: higher is better.

@@ -67,14 +67,20 @@ def _check_numbers(array: NDArray[Any], name: str) -> None:
 
 
 def checked_rows(estimator: Any, X: ArrayLike, y: ArrayLike | None, **options: Any) -> tuple[Floats, Floats]:
-    """X (n, e) and y (n,) or (n, d) in float64, checked by scikit-learn and by this package."""
+    """X (n, e) and y (n,) or (n, d) in float64, checked by scikit-learn and by this package.
+
+    Where ``reset`` is False the estimator is fitted, and y must have as many outputs as in the fit.
+    """
     if issparse(y):
         raise TypeError("Sparse data was passed for y, but dense data is required. Use '.toarray()'.")
     X, y = checked_values(X, "X"), checked_values(y, "y")
     if y is not None and not np.asarray(y).ndim:
         raise ValueError(f"y is {y!r}, must be an array: one row for each row of X.")
     checked: Any = validate_data(estimator, X, y, dtype=np.float64, y_numeric=True, multi_output=True, **options)
-    return checked[0], np.asarray(checked[1], dtype=np.float64)
+    inputs, targets = checked[0], np.asarray(checked[1], dtype=np.float64)
+    if not options.get("reset", True) and targets[0].size != estimator.n_outputs_:
+        raise ValueError(f"y has {targets[0].size} outputs, but the model was fitted with {estimator.n_outputs_}.")
+    return inputs, targets
 
 
 def checked_queries(estimator: Any, X: ArrayLike) -> Floats:

@@ -214,8 +214,6 @@ def as_recordings(model: Any, X: Any, y: Any, groups: Any, *, is_fit: bool) -> l
         )
     if is_fit:
         model._y_is_1d, model.n_outputs_ = targets.ndim == 1, targets[0].size
-    if targets[0].size != model.n_outputs_:
-        raise ValueError(f"y has {targets[0].size} outputs, but the model was fitted with {model.n_outputs_}.")
     numbers = np.zeros(len(inputs), dtype=np.intp) if groups is None else check_groups(groups, len(inputs))
     order = np.lexsort([inputs[:, 0], numbers])
     parts = np.split(order, np.flatnonzero(np.diff(numbers[order])) + 1)
