@@ -153,10 +153,10 @@ def planned(
     for end in ends:
         if (left := np.nan_to_num(likely.add(end.at, end.place))).any():
             rest[end.name] = own[end.name] + left
-    path = _path_at([point.at for point in (*known, *points)], controller, rest["goal"], rest["start"])
+    path = _path_to(rest["goal"], rest["start"], controller)
     # What was known stays, wherever the primitive takes the path.
-    beyond = [(at, place - path[at]) for _, at, place in known if ends]
-    beyond += [(at, likely.add(at, place - path[at], name)) for name, at, place in points]
+    beyond = [(at, place - path(at)) for _, at, place in known if ends]
+    beyond += [(at, likely.add(at, place - path(at), name)) for name, at, place in points]
     changes = np.reshape(likely.changes, (-1, controller.n_outputs_))
     bent = conditioned(controller, np.array(likely.times), changes, pins=pins)
     bend = bent.reproduction_.bend
@@ -164,14 +164,11 @@ def planned(
     return bent, rest["goal"], rest["start"]
 
 
-def _path_at(times: list[float], controller: Any, goal: Floats | None, start: Floats | None) -> dict[float, Floats]:
-    """Places (d,) of the primitive, to another goal from another start, at movement times."""
-    grid, plan = np.unique([0.0, *times]), controller.reproduction_.plan
+def _path_to(goal: Floats | None, start: Floats | None, controller: Any) -> CubicSpline:
+    """Places (d,) of the primitive to another goal from another start, over movement time."""
     goal = goal if goal is None or goal.ndim == 1 else None  # of one that moves nobody knows the path
-    if controller.adaptation == "safe" or (goal is None and start is None):
-        return dict(zip(grid.tolist(), plan(grid, goal, start, 1.0)[0][0], strict=True))
     even = np.linspace(0.0, controller.duration_, 20 * controller.n_steps)  # the equation is solved tick by tick
-    return dict(zip(grid.tolist(), CubicSpline(even, plan(even, goal, start, 1.0)[0][0])(grid), strict=True))
+    return CubicSpline(even, controller.reproduction_.plan(even, goal, start, 1.0)[0][0])
 
 
 class _Likely:
