@@ -69,10 +69,6 @@ class JointNormal:
         rows = {name: getattr(self, name)[steps] for name in ("mean", "factor", "time", "loadings", "explained")}
         return replace(self, taken=self.taken[:, steps], **rows)
 
-    def columns(self, steps: Int[Tensor, " m"]) -> Float[Tensor, "c n m"]:
-        """Columns of R at these steps."""
-        return self.along(self.time, self.time[steps])
-
     def covariance(self) -> Float[Tensor, "n d n d"]:
         """Covariance of all outputs at all steps."""
         # The inner part R - W W' + U U' first, and then a block of A on either side.
@@ -155,7 +151,7 @@ class Conditioned:
 
     def _given_steps(self, law: JointNormal) -> JointNormal:
         """Law, but for its mean, given steps known whole."""
-        between = law.columns(self._steps)
+        between = law.along(law.time, law.time[self._steps])  # of all steps, and those given
         root = safe_cholesky(between[:, self._steps], name="the correlation of the steps given")
         taken = torch.linalg.solve_triangular(root.mT, between, upper=True, left=False)
         self._gain = torch.linalg.solve_triangular(root, taken, upper=False, left=False)
@@ -173,7 +169,7 @@ class Conditioned:
         """Law, but for its mean, given single entries too."""
         steps, directions = self._entry_steps, self._directions
         rows = torch.einsum("pc,pcd->pd", directions, law.factor[steps])
-        between = law.columns(steps) - law.taken @ law.taken[:, steps].mT
+        between = law.along(law.time, law.time[steps]) - law.taken @ law.taken[:, steps].mT
         inner = between.transpose(0, 1) * rows.mT
         inner = inner + law.loadings @ torch.einsum("pd,pdk->kp", rows, law.loadings[steps])
         # Covariances of all steps with the entries, and the root of the entries' own.
