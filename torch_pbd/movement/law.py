@@ -16,11 +16,11 @@ from torch_pbd.checks import Floats
 from torch_pbd.data.alignment import TIMING_REMOVED
 from torch_pbd.data.demonstrations import Demonstration, Demonstrations
 from torch_pbd.estimators.validation import check_groups, checked_queries, checked_rows
+from torch_pbd.files.memory import require_much
 from torch_pbd.movement.joint import Conditioned, JointNormal
 
 _DECIMALS = 10  # decimals kept of a time over the range of the fit's times, so that 0.1 + 0.2 and 0.3 are equal
 _MOST_KEPT = 2048  # most times whose law is cached: a chunk of predictions, and what is known beside it
-_MOST_ENTRIES = 4096  # most entries conditioned on one by one: a matrix of their number squared is factorized
 
 
 class Known(NamedTuple):
@@ -136,11 +136,8 @@ class MovementLaw(BaseEstimator, ABC):
         if len(set(zip(self._rounded(known.time)[rows], outputs, strict=True))) < len(rows):
             raise ValueError("X has a time that is given twice, or is known already, without noise: leave it out.")
         n_single = int((~np.isnan(known.value) & ~known.exact.all(axis=1, keepdims=True)).sum())
-        if n_single > _MOST_ENTRIES:
-            raise ValueError(
-                f"y has {n_single} entries with noise or beside NaN, must be at most {_MOST_ENTRIES} with those known "
-                "already: give fewer times, or whole rows with noise_scale=0."
-            )
+        what = f"conditioning on {n_single} entries with noise or beside NaN"
+        require_much(4 * 8.0 * n_single**2, what=what, remedy="Give fewer times, or whole rows with noise_scale=0.")
         return copied
 
     def _times(self, X: ArrayLike) -> Floats:
