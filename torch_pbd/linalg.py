@@ -153,15 +153,19 @@ def log_density(
     It is normal, or multivariate Student's t of ``degrees`` above two; where these are many they are the same.
     """
     whitened = torch.linalg.solve_triangular(scale_tril, residual.unsqueeze(-1), upper=False)
-    square, size = whitened.square().sum((-2, -1)), residual.shape[-1]
+    return log_density_at(whitened.square().sum((-2, -1)), residual.shape[-1], degrees) - log_det(scale_tril)
+
+
+def log_density_at(square: Tensor, size: int | Tensor, degrees: Tensor | None = None) -> Tensor:
+    """Log density of :func:`log_density` with unit covariance, in ``size`` dimensions, at squared distances."""
     if degrees is None:
-        return -0.5 * square - log_det(scale_tril) - 0.5 * size * math.log(2 * math.pi)
+        return -0.5 * square - 0.5 * size * math.log(2 * math.pi)
     # With the scale matrix (df - 2) / df times the covariance the density is
     # gamma((df + d) / 2) / gamma(df / 2) |(df - 2) pi S|^-1/2 (1 + x' S^-1 x / (df - 2))^-(df + d)/2.
     capped = degrees.clamp_max(1e7)  # beyond, the gamma functions lose more digits than the two densities differ by
     constant = torch.lgamma(0.5 * (capped + size)) - torch.lgamma(0.5 * capped)
     constant = constant - 0.5 * size * (math.pi * (capped - 2.0)).log()
-    return constant - log_det(scale_tril) - 0.5 * (capped + size) * torch.log1p(square / (capped - 2.0))
+    return constant - 0.5 * (capped + size) * torch.log1p(square / (capped - 2.0))
 
 
 class _SpectralMap(torch.autograd.Function):

@@ -260,17 +260,11 @@ def _checked_points(via: Any, controller: Any) -> list[_Point]:
 
 def _known_points(controller: Any) -> list[_Point]:
     """What a conditioned controller knows without noise: where it is there."""
-    known, reproduction = controller.covariance_._known, controller.reproduction_
-    times = reproduction.time_of(known.time)
-    rows = zip(
-        times.tolist(), known.exact.reshape(-1, controller.n_outputs_), reproduction.motion(times)[0], strict=True
-    )
-    ends = -_rounding(controller), controller.duration_ + _rounding(controller)
-    return [
-        _Point("what is known", at, np.where(exact, place, np.nan))
-        for at, exact, place in rows
-        if exact.any() and ends[0] <= at <= ends[1]
-    ]
+    known, reproduction, middle = controller.covariance_._known, controller.reproduction_, 0.5 * controller.duration_
+    times, exact = reproduction.time_of(known.time), known.exact.reshape(-1, controller.n_outputs_)
+    inside = exact.any(axis=1) & (np.abs(times - middle) <= middle + _rounding(controller))
+    places = np.where(exact, reproduction.motion(times)[0], np.nan)
+    return [_Point("what is known", *row) for row in zip(times[inside].tolist(), places[inside], strict=True)]
 
 
 def _distinct(given: list[_Point], fixed: list[_Point], controller: Any) -> list[_Point]:

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torch_pbd.linalg import safe_cholesky, spectral_map, symmetrize
+from torch_pbd.linalg import log_density_at, log_det, safe_cholesky, spectral_map, symmetrize
 
 Along = Callable[[Tensor, Tensor], Tensor]
 """Correlation R between times (n,) and others (m,): (c, n, m)."""
@@ -97,7 +97,7 @@ class JointNormal:
         # The residual and V, before A, and U, all whitened by R - W W'.
         inner = torch.linalg.solve(self.factor, torch.cat([(x - self.mean)[..., None], self.explained], dim=2))
         columns = torch.cat([self.loadings, inner], dim=2).transpose(0, 1)
-        root, size = self.correlation_root, x.numel()
+        root = self.correlation_root
         whitened = torch.linalg.solve_triangular(root, columns, upper=False).flatten(0, 1)
         loadings, rows = whitened.tensor_split([self.loadings.shape[2]], dim=1)
         # Woodbury: with the capacitance C = I + U' U, the determinant of S = I + U U' is that of C, and the squares
@@ -111,15 +111,11 @@ class JointNormal:
         rest = torch.eye(len(gram) - 1).to(gram) - gram[1:, 1:]
         rest_root = safe_cholesky(rest, name="what observations leave open of the movement")
         cross = torch.linalg.solve_triangular(rest_root, gram[1:, :1], upper=False)
-        square = float(gram[0, 0] + cross.square().sum())
-        along = root.diagonal(dim1=1, dim2=2).log().sum() * (x.shape[1] // len(root))
-        half_log_det = float(along + torch.linalg.slogdet(self.factor).logabsdet.sum())
-        half_log_det += float(capacitance_root.diagonal().log().sum() + rest_root.diagonal().log().sum())
-        if not math.isfinite(df):
-            return -0.5 * (square + size * math.log(2.0 * math.pi)) - half_log_det
-        # linalg.log_density is the same but takes a factor of the covariance, which is never formed here.
-        constant = math.lgamma(0.5 * (df + size)) - math.lgamma(0.5 * df) - 0.5 * size * math.log((df - 2.0) * math.pi)
-        return constant - half_log_det - 0.5 * (df + size) * math.log1p(square / (df - 2.0))
+        log_dets = torch.linalg.slogdet(self.factor).logabsdet.sum() + log_det(root).sum() * (x.shape[1] // len(root))
+        log_dets = log_dets + log_det(capacitance_root) + log_det(rest_root)
+        square = gram[0, 0] + cross.square().sum()
+        degrees = square.new_tensor(df) if math.isfinite(df) else None
+        return float(log_density_at(square, x.numel(), degrees) - log_dets)
 
 
 class Conditioned:

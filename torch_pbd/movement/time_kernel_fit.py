@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from torch_pbd.linalg import log_density_at
 from torch_pbd.movement.output_kernel import OutputSeries, Start, unit_rms
 from torch_pbd.movement.time_kernel import LeftOut, TimeKernel, left_out
 
@@ -88,9 +89,7 @@ def movement_df(square: Float[Tensor, " K"], size: Int64[Tensor, " K"], most: fl
     than a new one does: these may say fewer degrees of freedom than ``most``, never more.
     """
     df = most * (FEWEST_DF / most) ** torch.linspace(0.0, 1.0, _N_DF, dtype=torch.float64)[:, None]
-    value = torch.lgamma(0.5 * (df + size)) - torch.lgamma(0.5 * df) - 0.5 * size * (df - 2.0).log()
-    value = value - 0.5 * (df + size) * torch.log1p(square / (df - 2.0))
-    return max(FEWEST_DF, float(df[value.sum(1).argmax()]))
+    return max(FEWEST_DF, float(df[log_density_at(square, size, df).sum(1).argmax()]))
 
 
 def _likeliest_kernel(
