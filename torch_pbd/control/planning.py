@@ -172,9 +172,10 @@ class Planning(BaseEstimator):
             compliant. With phase_input="s" models that extrapolate flatly in s keep it stiff.
         goal, start : array-like of shape (d,), default=None
             Goal and start in the units of the recordings; None are ``goal_`` and ``start_``, or after :meth:`condition`
-            the ends of the bent movement: give ``goal_`` where the goal must not move with it. A moving goal is (n, d),
-            one row each, without ``via``. Poses, here and in ``via``, are p positions and a unit quaternion w x y z, or
-            p + 3 outputs.
+            the ends of the bent movement: give ``goal_`` where the goal must not move with it. With a model of whole
+            movements ends that are given are met, stiffly, as via points are, ``goal_`` itself too. A moving goal is
+            (n, d), one row each, without ``via``. Poses, here and in ``via``, are p positions and a unit quaternion
+            w x y z, or p + 3 outputs.
         via : sequence of (time, position), default=None
             Points that the movement passes, stiff enough to meet them: movement time in s from its start, and position
             (d,) in the units of the recordings, NaN where an output is free (a rotation as a whole). ``covariance``

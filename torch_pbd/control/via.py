@@ -144,7 +144,6 @@ def planned(
     if len(controller.covariance_._known.time):  # observations, those with noise too, moved the ends of the path
         here = dict(zip(at_ends, reproduction.motion(np.array([0.0, duration]))[0], strict=True))
     ends = [end._replace(place=end.place - here[end.name]) for end in _distinct(given, known, controller)]
-    ends = [end for end in ends if (np.abs(end.place) > checks.ROUNDING * _extents(controller)).any()]
     taken = np.array([point.at for point in (*known, *points, *ends)])
     rest = {name: aim if aim is not None and aim.ndim > 1 else None for name, aim in rest.items()}  # goals that move
     still = [at_ends[name] for name, aim in rest.items() if aim is None]
