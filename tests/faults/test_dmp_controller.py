@@ -18,7 +18,7 @@ from torch_pbd.control import AdmittancePlant, StiffnessLaw
 from torch_pbd.data import make_tunnel_demonstrations
 from torch_pbd.exceptions import DataRankWarning
 
-QUERIES = ["predict", "predict_stiffness", "predict_damping"]
+QUERIES = ["predict", "predict_cov", "predict_stiffness", "predict_damping"]
 
 
 def new(**parameters):
@@ -236,7 +236,7 @@ def test_25_a_fit_that_fails_leaves_no_mixture_of_two():
 def test_26_no_times_are_none():
     none = np.empty((0, 1))
     shapes = [getattr(controller(), method)(none).shape for method in QUERIES]
-    assert shapes == [(0, 2), (0, 2, 2), (0, 2, 2)]
+    assert shapes == [(0, 2), (0, 2, 2), (0, 2, 2), (0, 2, 2)]
 
 
 BAD_VALUES = ["1e-3", np.nan, np.inf, -1.0, 0.0, True, [1.0], 1j, 10**400]

@@ -193,10 +193,11 @@ def test_units_and_origins_of_outputs_decide_nothing(make, unit, origin):
     np.testing.assert_allclose(own_covariance, covariance, rtol=0, atol=1e-9)
 
 
-def test_promp_takes_what_a_recording_that_ends_early_does_not_show_from_the_others():
+@pytest.mark.parametrize("shown", [GRID < 0.6, np.isin(GRID, GRID[[0, 15, -1]])])
+def test_promp_takes_what_a_recording_that_ends_early_or_has_few_samples_does_not_show_from_the_others(shown):
     once = basis_functions(GRID, 8, 0.7) @ np.random.default_rng(0).normal(size=(8, 2))
     inputs, y, groups = stacked(np.stack([once] * 6))
-    seen = (groups % 2 == 0) | (inputs[:, 0] < 0.6)
+    seen = (groups % 3 > 0) | np.tile(shown, 6)
     model, partial = ProMPBaseline(n_basis=8, overlap=0.7), ProMPBaseline(n_basis=8, overlap=0.7)
     with pytest.warns(DataRankWarning, match="The demonstrations are identical: their covariance is zero"):
         model.fit(inputs, y, groups=groups)
@@ -287,8 +288,9 @@ def test_a_fit_that_fails_leaves_what_was_fitted(make):
         model.fit(inputs + 60.4 * groups[:, np.newaxis], y, groups=groups)  # stamps of a clock
     np.testing.assert_array_equal(model.condition([[0.5]], [[0.3, 0.3]]).predict(X), before)
     assert not make()._known.time.size
-    with pytest.raises(NotFittedError):
-        make().score(inputs, y, groups=groups)
+    for method, arguments in [("score", (inputs, y)), ("predict", (X,)), ("predict_uncertainty", (X,))]:
+        with pytest.raises(NotFittedError):
+            getattr(make(), method)(*arguments)
 
 
 @pytest.mark.parametrize("make", [TrajectoryRegressor, ProMPBaseline, KMPBaseline])

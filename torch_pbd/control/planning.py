@@ -98,8 +98,8 @@ class Planning(BaseEstimator):
 
     def predict_cov(self, X: ArrayLike) -> Floats:
         """Covariance (n, d, d) of the outputs at times X (n, 1), in squared units; poses are in their chart."""
-        inputs = self.reproduction_.phase(self._movement_time(X))
-        return self.outputs_.covariance(self.covariance_.predict_cov(inputs))
+        time = self._movement_time(X)
+        return self.outputs_.covariance(self.covariance_.predict_cov(self.reproduction_.phase(time)))
 
     def condition(self, times: ArrayLike, positions: ArrayLike, *, noise_scale: ArrayLike = 0.0) -> Self:
         """Fitted copy, conditioned on passing positions: a via point, the part observed so far, or a push.

@@ -153,7 +153,7 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         """
         time = self._times(X)
         what = f"the covariance between all {len(time)} rows and {self.n_outputs_} outputs"
-        remedy = "Ask for fewer rows; sample_demonstrations and score_demonstrations never form it."
+        remedy = "Ask for fewer rows; to draw and to score movements no model but KMPBaseline forms it."
         require_much(4 * 8.0 * (len(time) * self.n_outputs_) ** 2, what=what, remedy=remedy)
         weight, parts = self._components(time)
         moments = []

@@ -16,9 +16,10 @@ from torch_pbd.estimators.door import Standardization
 from torch_pbd.estimators.mixture import GMMBaseline
 from torch_pbd.estimators.validation import fit_with_groups
 from torch_pbd.files.memory import require_much
+from torch_pbd.linalg import safe_cholesky
 from torch_pbd.movement.base import MovementRegressor
 from torch_pbd.movement.joint import Conditioned, JointNormal
-from torch_pbd.movement.law import as_rows, check_arrays, check_regressor, semidefinite_root
+from torch_pbd.movement.law import as_rows, check_arrays, check_regressor
 
 _ARRAYS = ("reference.time", "reference.mean", "reference.covariance", "range", "shift", "scale")  # in model files
 _NOTHING = 1e6  # variance of an output of which nothing is said, of standardized outputs
@@ -117,9 +118,12 @@ class KMPBaseline(MovementRegressor):
         explained = whitened.transpose(0, 2, 1).reshape(n * d, whitened.shape[1])
         # Time by time, all outputs of each: the kernel of the times acts on each output separately.
         gram = np.kron(self._kernel(time, time), np.eye(d))
-        root = semidefinite_root(level * (gram - explained @ explained.T)).reshape(n, d, n * d)
-        root *= self._scale[:, np.newaxis]
-        return JointNormal.with_noise(*map(torch.from_numpy, (time, mean, root, np.sqrt(self.nugget) * self._scale)))
+        # With half of the nugget it has a Cholesky factor, at a tenth of the cost of its eigenvectors.
+        smooth = level * (gram - explained @ explained.T) + 0.5 * self.nugget * np.eye(n * d)
+        root = safe_cholesky(torch.from_numpy(smooth), name="the covariance between rows").numpy()
+        root = root.reshape(n, d, n * d) * self._scale[:, np.newaxis]
+        own = np.sqrt(0.5 * self.nugget) * self._scale
+        return JointNormal.with_noise(*map(torch.from_numpy, (time, mean, root, own)))
 
     def _rows(self, time: Floats) -> tuple[Floats, Floats]:
         # Each row alone: the covariance between rows would cost the cube of their number to factorize.

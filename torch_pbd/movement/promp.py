@@ -38,8 +38,8 @@ class ProMPBaseline(MovementRegressor):
     Parameters
     ----------
     n_basis : int or "auto", default="auto"
-        Number of bases, at most one less than the samples of each demonstration; "auto" takes 8 to 20 by the likelihood
-        of demonstrations left out in turn.
+        Number of bases, at most one less than the samples of the median demonstration; "auto" takes 8 to 20 by the
+        likelihood of demonstrations left out in turn.
     overlap : float or "auto", default="auto"
         About the value of a basis, before normalization, midway to its neighbour's centre, 0 to 1: it is this to the
         power ``(n_basis / (n_basis - 1))**2``. "auto" takes 0.7, 0.85 or 0.92 by the same likelihood.
@@ -94,7 +94,7 @@ class ProMPBaseline(MovementRegressor):
         # A ridge shrinks towards 0, which must be a position of the movement, and not the user's origin.
         scaling = Standardization.fit(*as_rows(recordings)[:2])
         scaled = [Demonstration(self._scaled(time), scaling.outputs(y, exact=True)) for time, y in recordings]
-        most = max(2, min(len(time) for time, _ in recordings) - 1)
+        most = max(2, int(np.median([len(time) for time, _ in recordings])) - 1)
         sizes = _N_BASES if self.n_basis == "auto" else (int(self.n_basis),)
         overlaps = _OVERLAPS if self.overlap == "auto" else (float(self.overlap),)
         pairs = itertools.product(sorted({min(size, most) for size in sizes}), overlaps)
@@ -140,7 +140,8 @@ class _Weights:
     def __init__(self, recordings: list[Demonstration], n_basis: int, overlap: float, ridge: float) -> None:
         self.n_basis, self.overlap = n_basis, overlap
         self._samples = [(basis_functions(time, n_basis, overlap), position) for time, position in recordings]
-        # A recording that ends early says nothing of its last weights, which are then those of all together.
+        # A recording that ends early, or has few samples, says nothing of some weights, which are then those of all
+        # together.
         common = _ridge_weights(*map(np.concatenate, zip(*self._samples, strict=True)), ridge=ridge)
         weights = [common + _ridge_weights(bases, y - bases @ common, ridge=ridge) for bases, y in self._samples]
         residual = np.concatenate([y - bases @ own for (bases, y), own in zip(self._samples, weights, strict=True)])

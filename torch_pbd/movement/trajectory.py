@@ -228,9 +228,10 @@ class TrajectoryRegressor(TimedMovement):
 
     def predict(self, X: ArrayLike, *, return_std: bool = False, return_cov: bool = False) -> Any:
         """Prediction of the regressor, or after :meth:`condition` mean and covariance of the rest of the movement."""
+        time = self._times(X)[:, np.newaxis]
         if not self._is_regressor:
-            return super().predict(X, return_std=return_std, return_cov=return_cov)
-        return self.regressor_.predict(self._times(X)[:, np.newaxis], return_std=return_std, return_cov=return_cov)
+            return super().predict(time, return_std=return_std, return_cov=return_cov)
+        return self.regressor_.predict(time, return_std=return_std, return_cov=return_cov)
 
     def predict_df(self, X: ArrayLike) -> Floats:
         """Degrees of freedom (n_samples,) of the marginals, or of the joint law after :meth:`condition`."""
