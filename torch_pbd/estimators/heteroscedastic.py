@@ -90,7 +90,9 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
     one: demonstrations are smoother, but a model that trusts their smoothness takes it for signal. The tails of the
     predictive law then include the mean's error, and correlations are shrunk by their own errors.
 
-    The fit depends on the order of the outputs, as its factor does: a variance by up to 20 % with six demonstrations.
+    The fit depends on the order of the outputs and on the axes of their frame, as its factor does: with six
+    demonstrations a variance was up to 4.4 times as large in a turned frame, or a tenth with the columns reversed, with
+    more up to 2.4 times (``scripts/benchmarks/column_order.py``).
 
     References
     ----------
