@@ -287,6 +287,14 @@ def test_own_ends_change_no_path_and_what_is_known_stays_in_any_form_of_movement
     np.testing.assert_allclose(moved.position[100], where, rtol=0, atol=atol)
 
 
+@pytest.mark.parametrize("regressor", [ProMPBaseline(), TrajectoryRegressor(GMMBaseline())])
+def test_an_end_known_nearly_without_noise_is_no_singular_one(regressor):
+    controller = DMPController(regressor).fit(demonstrations())
+    known = controller.condition([0.0], [controller.start_], noise_scale=1e-12)
+    plan = known.schedule(rate=100.0, start=controller.start_)
+    np.testing.assert_allclose(plan.position, controller.schedule(rate=100.0).position, rtol=0, atol=1e-6)
+
+
 def test_a_movement_that_was_pushed_goes_on_from_where_it_is(controller):
     pushed = controller.predict([[1.0]])[0] + [0.02, -0.02]
     again = controller.condition([1.0], [pushed])

@@ -209,6 +209,15 @@ def test_promp_takes_what_a_recording_that_ends_early_or_has_few_samples_does_no
         np.testing.assert_allclose(each.predict(X), once, atol=1e-3)
 
 
+def test_recordings_of_few_samples_say_little_of_promps_noise():
+    rng = np.random.default_rng(0)
+    smooth = basis_functions(GRID, 12, 0.7) @ rng.normal(size=(9, 12, 2))
+    inputs, y, groups = stacked(smooth + 0.01 * rng.normal(size=smooth.shape))
+    seen = (groups > 3) | np.isin(inputs[:, 0], GRID[[0, 15, -1]])
+    model = ProMPBaseline(n_basis=12, overlap=0.7).fit(inputs[seen], y[seen], groups=groups[seen])
+    assert (np.abs(np.log(model.noise_scale_ / 0.01)) < 0.3).all()
+
+
 def test_scores_pass_through_a_pipeline_with_the_groups():
     inputs, y, groups = stacked(movements(6))
     with sklearn.config_context(enable_metadata_routing=True):

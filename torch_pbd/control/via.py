@@ -180,6 +180,7 @@ class _Likely:
         self.times, self.changes = list[float](), list[Floats]()
         self._controller, self._outputs = controller, controller.outputs_
         self._model = controller.covariance_.observed_along(self._outputs.axes)
+        self._least = np.diag(np.square(checks.ROUNDING * _extents(controller)))
         if pins:
             stays = controller.reproduction_.phase(np.array(pins))
             self._model = self._model.condition(stays, self._outputs.decode(self._model.predict(stays)))
@@ -190,9 +191,11 @@ class _Likely:
         before = _in_model(self._controller, np.array([at]))[0][0]
         now = self._outputs.decode(self._model.predict(inputs))[0]
         left, size = change - (now - before), int(given.sum())
-        covariance = self._outputs.covariance(self._model.predict_cov(inputs))[0][np.ix_(given, given)]
+        # Of an end that is known nearly without noise rounding leaves no more than this.
+        covariance = self._outputs.covariance(self._model.predict_cov(inputs))[0] + self._least
+        covariance = covariance[np.ix_(given, given)]
         degrees = min(float(self._model.predict_df(inputs)[0]), 1e12)  # infinite ones are not for f
-        distance = float(left[given] @ np.linalg.solve(covariance, left[given])) ** 0.5  # Mahalanobis distance
+        distance = max(0.0, float(left[given] @ np.linalg.solve(covariance, left[given]))) ** 0.5  # Mahalanobis
         limit = float(size * f.ppf(_LIKELY, size, degrees) * (degrees - 2.0) / degrees) ** 0.5
         if name and distance > limit:
             checks.warn(

@@ -22,6 +22,7 @@ from torch_pbd.movement.joint import Conditioned, JointNormal
 from torch_pbd.movement.law import as_rows, check_arrays, check_regressor
 
 _ARRAYS = ("reference.time", "reference.mean", "reference.covariance", "range", "shift", "scale")  # in model files
+_BETWEEN = "the covariance between rows, of which lambda_cov or nugget is too small,"
 _NOTHING = 1e6  # variance of an output of which nothing is said, of standardized outputs
 _LEAST = 1e-6  # least variance in the reference, of standardized outputs; the paper's of a point without noise
 
@@ -118,9 +119,9 @@ class KMPBaseline(MovementRegressor):
         explained = whitened.transpose(0, 2, 1).reshape(n * d, whitened.shape[1])
         # Time by time, all outputs of each: the kernel of the times acts on each output separately.
         gram = np.kron(self._kernel(time, time), np.eye(d))
-        # With half of the nugget it has a Cholesky factor, at a tenth of the cost of its eigenvectors.
+        # With half of the nugget it has a Cholesky factor, at a fifth of the cost of its eigenvectors.
         smooth = level * (gram - explained @ explained.T) + 0.5 * self.nugget * np.eye(n * d)
-        root = safe_cholesky(torch.from_numpy(smooth), name="the covariance between rows").numpy()
+        root = safe_cholesky(torch.from_numpy(smooth), name=_BETWEEN).numpy()
         root = root.reshape(n, d, n * d) * self._scale[:, np.newaxis]
         own = np.sqrt(0.5 * self.nugget) * self._scale
         return JointNormal.with_noise(*map(torch.from_numpy, (time, mean, root, own)))

@@ -137,7 +137,7 @@ class MovementLaw(BaseEstimator, ABC):
             raise ValueError("X has a time that is given twice, or is known already, without noise: leave it out.")
         n_single = int((~np.isnan(known.value) & ~known.exact.all(axis=1, keepdims=True)).sum())
         what = f"conditioning on {n_single} entries with noise or beside NaN"
-        require_much(4 * 8.0 * n_single**2, what=what, remedy="Give fewer times, or whole rows with noise_scale=0.")
+        require_much(12 * 8.0 * n_single**2, what=what, remedy="Give fewer times, or whole rows with noise_scale=0.")
         return copied
 
     def _times(self, X: ArrayLike) -> Floats:
@@ -172,9 +172,10 @@ class MovementLaw(BaseEstimator, ABC):
         if len(time) > _MOST_KEPT:
             return self._prior(time)
         kept = self.__dict__.setdefault("_kept", {})
-        if not np.array_equal(kept.get("time"), time):
-            kept |= {"law": self._prior(time), "time": time}
-        law: JointNormal = kept["law"]
+        last = kept.get("last")  # times and law in one, as copies in other threads share it
+        if last is None or not np.array_equal(last[0], time):
+            last = kept["last"] = time, self._prior(time)
+        law: JointNormal = last[1]
         return law
 
     def _copy(self) -> Self:

@@ -147,7 +147,7 @@ class _Weights:
         residual = np.concatenate([y - bases @ own for (bases, y), own in zip(self._samples, weights, strict=True)])
         self.values: Floats = np.stack(weights)  # (K, n_basis, d)
         # Degrees of freedom: samples minus the weights that were fitted to them.
-        freedoms = max(1, len(residual) - n_basis * len(recordings))
+        freedoms = max(1, sum(max(0, len(bases) - n_basis) for bases, _ in self._samples))
         self.noise_scale: Floats = np.maximum(np.sqrt(np.square(residual).sum(axis=0) / freedoms), _LEAST_NOISE)
 
     def covariance(self, values: Floats, reach: float, share: float) -> Floats:

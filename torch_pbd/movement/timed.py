@@ -6,7 +6,7 @@ from typing import Any, Self
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import Akima1DInterpolator
 from torch import Tensor
 
 from torch_pbd import checks
@@ -29,8 +29,7 @@ _SLACK = 1e-3  # share of a duration: where all last equally long, rounding may 
 # Most steps on which the correlation is learned: the nuggets' iterations are cubic in them, and movements are smooth.
 _MOST_STEPS = 200
 _GAP = 2.0  # sample spacings of a recording: a step farther than that from its samples counts as missing
-# Sample spacings: the noise of two samples closer than that, over the time between them, would bend a spline.
-_TOO_CLOSE = 0.1
+_TOO_CLOSE = 0.1  # sample spacings: of two samples nearer than that the noise, over the time between them, is a slope
 
 
 class TimedMovement(MovementRegressor):
@@ -182,9 +181,9 @@ class TimedMovement(MovementRegressor):
         shared = np.linspace(0.0, 1.0, n_grid_steps(recordings))
         phased = []
         for (time, position), own in zip(recordings, pace, strict=True):
-            values = sampled(Demonstration(time / time[-1], position), time_of(torch.from_numpy(shared), own).numpy())
-            seen = ~np.isnan(values).any(axis=1)
-            phased.append(Demonstration(shared[seen], values[seen]))
+            at = time[-1] * time_of(torch.from_numpy(shared), own).numpy()
+            seen = _is_near(time, at)
+            phased.append(Demonstration(shared[seen], interpolate(time, position, at[seen])))
         return phased
 
     def _gain(self, recordings: list[Demonstration]) -> float:
@@ -246,14 +245,20 @@ def n_grid_steps(recordings: list[Demonstration]) -> int:
 
 
 def sampled(recording: Demonstration, grid: Floats) -> Floats:
-    """Values of a recording at the steps of a grid, by a cubic spline; NaN where no sample is near.
+    """Values of a recording at the steps of a grid, NaN where no sample is near.
 
-    Chords between samples would be off by more than the noise where recordings have times of their own.
+    Chords between samples would be off by more than the noise where recordings have times of their own, and a spline
+    would carry the noise of two samples that are close on to where they are far apart: Akima's polynomials are local.
     """
     time, position = recording
-    right, spacing = np.clip(np.searchsorted(time, grid), 1, len(time) - 1), np.diff(time, prepend=-np.inf)
-    usual = np.median(spacing[1:])
+    spacing = np.diff(time, prepend=-np.inf)
+    apart = spacing > _TOO_CLOSE * np.median(spacing[1:])
+    values = Akima1DInterpolator(time[apart], position[apart], extrapolate=True)(grid.clip(time[0], time[-1]))
+    return np.where(_is_near(time, grid)[:, np.newaxis], values, np.nan)
+
+
+def _is_near(time: Floats, grid: Floats) -> NDArray[np.bool_]:
+    """Whether a sample is near each step of a grid."""
+    right = np.clip(np.searchsorted(time, grid), 1, len(time) - 1)
     nearest = np.minimum(np.abs(grid - time[right - 1]), np.abs(time[right] - grid))
-    apart = spacing > _TOO_CLOSE * usual
-    values = CubicSpline(time[apart], position[apart])(grid.clip(time[0], time[-1]))
-    return np.where((nearest <= _GAP * usual)[:, np.newaxis], values, np.nan)
+    return np.asarray(nearest <= _GAP * np.median(np.diff(time)))

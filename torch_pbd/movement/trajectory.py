@@ -228,15 +228,17 @@ class TrajectoryRegressor(TimedMovement):
 
     def predict(self, X: ArrayLike, *, return_std: bool = False, return_cov: bool = False) -> Any:
         """Prediction of the regressor, or after :meth:`condition` mean and covariance of the rest of the movement."""
-        time = self._times(X)[:, np.newaxis]
         if not self._is_regressor:
-            return super().predict(time, return_std=return_std, return_cov=return_cov)
+            return super().predict(X, return_std=return_std, return_cov=return_cov)
+        time = self._times(X)[:, np.newaxis]  # which says so before a fit
         return self.regressor_.predict(time, return_std=return_std, return_cov=return_cov)
 
     def predict_df(self, X: ArrayLike) -> Floats:
         """Degrees of freedom (n_samples,) of the marginals, or of the joint law after :meth:`condition`."""
+        if not self._is_regressor:
+            return super().predict_df(X)
         time = self._times(X)[:, np.newaxis]
-        return self.regressor_.predict_df(time) if self._is_regressor else super().predict_df(time)
+        return self.regressor_.predict_df(time)
 
     @property
     def _is_regressor(self) -> bool:
