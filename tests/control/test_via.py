@@ -1,7 +1,10 @@
 """Movements bent through via points, to goals, and on from where a robot was pushed, by models of whole movements."""
 
+import copy
+
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
 from torch_pbd import (
     CholeskyCovRegressor,
@@ -285,6 +288,18 @@ def test_own_ends_change_no_path_and_what_is_known_stays_in_any_form_of_movement
     known = known.condition([1.2], known.predict([[1.2]]) + 0.002)
     moved = known.schedule(rate=100.0, start=controller.start_ + 0.05)
     np.testing.assert_allclose(moved.position[100], where, rtol=0, atol=atol)
+
+
+def test_a_bent_movement_brakes_from_its_own_speed(controller):
+    bent = copy.copy(controller)
+    bent.reproduction_ = copy.copy(controller.reproduction_)
+    change = [[0.0, 0.0], [0.0, 0.0], [0.02, 0.0]]
+    bent.reproduction_.bend = CubicSpline([0.0, 1.0, 2.0], change, bc_type=((1, [0.0, 0.0]), (1, [0.05, 0.0])))
+    plain, plan = (each.schedule(rate=1000.0, settle=0.5) for each in (controller, bent))
+    assert np.linalg.norm(plan.velocity[-1]) == 0.0
+    # By the speed of the movement before it was bent it would stand within 3 ms, at 16 m/s^2.
+    most = [np.linalg.norm(each.acceleration, axis=1).max() for each in (plain, plan)]
+    assert most[1] < 2.0 * most[0]
 
 
 @pytest.mark.parametrize("regressor", [ProMPBaseline(), TrajectoryRegressor(GMMBaseline())])

@@ -24,9 +24,11 @@ from torch_pbd import (
     load_demonstrations,
 )
 from torch_pbd.data import make_tunnel_demonstrations
+from torch_pbd.data.demonstrations import Demonstration
 from torch_pbd.kernels import correlation
 from torch_pbd.movement import output_kernel, time_kernel_fit
 from torch_pbd.movement.time_kernel_fit import fit_time_kernel, smoothest_first
+from torch_pbd.movement.timed import sampled
 
 GRID = np.linspace(0.0, 1.0, 30)
 
@@ -287,6 +289,17 @@ def test_samples_at_times_of_their_own_are_no_noise_and_their_noise_does_not_gro
     assert 0.8 < np.diff(draws, n=2, axis=1).std() / np.diff(shown, n=2, axis=1).std() < 1.5
     likely = [model.score(at[:, None], new, groups=np.zeros(51)) for model in (even, own)]
     assert likely[1] > likely[0] - lost
+
+
+def test_a_burst_of_samples_is_thinned_not_lost():
+    """With a tenth of the samples' usual distance between those of a burst, in the middle or at the end."""
+    grid, coarse, fine = np.linspace(0.0, 3.0, 200), 0.1, 0.1 / 10.5
+    middle = np.concatenate([np.arange(0.0, 1.3, coarse), np.arange(1.3, 1.38, fine), np.arange(1.4, 3.01, coarse)])
+    end = np.concatenate([np.arange(0.0, 2.8, coarse), np.arange(2.8, 2.99, fine)])
+    for time in (middle, end):
+        found = sampled(Demonstration(time, np.sin(3.0 * time)[:, np.newaxis]), grid)[:, 0]
+        within = grid <= time[-1]
+        np.testing.assert_allclose(found[within], np.sin(3.0 * grid)[within], atol=0.01)
 
 
 def test_nuggets_take_missing_steps_for_missing():

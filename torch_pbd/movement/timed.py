@@ -251,9 +251,12 @@ def sampled(recording: Demonstration, grid: Floats) -> Floats:
     would carry the noise of two samples that are close on to where they are far apart: Akima's polynomials are local.
     """
     time, position = recording
-    spacing = np.diff(time, prepend=-np.inf)
-    apart = spacing > _TOO_CLOSE * np.median(spacing[1:])
-    values = Akima1DInterpolator(time[apart], position[apart], extrapolate=True)(grid.clip(time[0], time[-1]))
+    close, kept = _TOO_CLOSE * np.median(np.diff(time)), [0]
+    for number, each in enumerate(time.tolist()):
+        if each - time[kept[-1]] > close:
+            kept.append(number)
+    kept[-1] = len(time) - 1  # nothing is extrapolated
+    values = Akima1DInterpolator(time[kept], position[kept])(grid.clip(time[0], time[-1]))
     return np.where(_is_near(time, grid)[:, np.newaxis], values, np.nan)
 
 

@@ -195,6 +195,8 @@ class Reproduction:
         """
         end, curve = float(self.time[-1]), self._curve
         bends, last = curve(self.time, 2), curve(end, 1)
+        if self.bend is not None:
+            bends, last = bends + self.bend(self.time, 2), last + self.bend(end, 1)
         largest = [max(float(np.linalg.norm(bends[:, own], axis=1).max()), np.finfo(float).tiny) for own in self.blocks]
         needed = max(
             1.5 * float(np.linalg.norm(last[own])) / most for own, most in zip(self.blocks, largest, strict=True)
